@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import socket
 from collections.abc import Callable
 from functools import cache, partial
 from hashlib import sha256
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from sweep.errors import MachineFaultError, RunError
+from sweep.messages import local_fault
 
 try:
     import numba
@@ -24,6 +24,9 @@ except (ValueError, TypeError) as error:
     raise RunError(
         f"Numba cannot be imported with its NUMBA_... variables: {type(error).__name__}: {error}"
     ) from None
+
+#: Rooms with compiled functions.
+ROOMS = ("model", "measure", "fitting")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -76,26 +79,17 @@ def _compile(dispatcher: Any, compile_signature: Callable[[Any], Any], signature
     except (numba.errors.NumbaError, MachineFaultError):
         raise
     except Exception as error:
-        raise MachineFaultError(
+        raise local_fault(
             f"compiled code in {dispatcher.stats.cache_path} cannot be loaded or saved "
-            f"({type(error).__name__}: {error}): delete its .nbi and .nbc files",
-            socket.gethostname(),
+            f"({type(error).__name__}: {error}): delete its .nbi and .nbc files"
         ) from error
-
-
-def compiled_sources() -> tuple[Path, ...]:
-    """Return the files with compiled functions, and this one, which has the options."""
-    package = Path(__file__).parent
-    files = sorted(
-        file for room in ("model", "measure", "fitting") for file in package.glob(f"{room}/*.py")
-    )
-    return (*(file for file in files if b"\n@compiled" in file.read_bytes()), Path(__file__))
 
 
 @cache
 def _sources() -> str:
-    """Return a digest of all files with compiled functions.
+    """Return a digest of all files that may have compiled functions, and of this one.
 
-    A constant that compiled code uses must be declared in one of :func:`compiled_sources`, too.
+    A constant that compiled code uses must be declared in one of these, too.
     """
-    return sha256(b"".join(path.read_bytes() for path in compiled_sources())).hexdigest()
+    files = (each for room in ROOMS for each in sorted(Path(__file__).parent.glob(f"{room}/*.py")))
+    return sha256(b"".join(each.read_bytes() for each in (*files, Path(__file__)))).hexdigest()

@@ -9,9 +9,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -163,10 +162,9 @@ def declared_fields(declaring: type) -> dict[str, Declared]:
         declaration = field.metadata["declaration"]
         unit = declaration.unit or next(
             (unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
-        hint, default = hints[field.name], field.default
-        joined = typing.get_origin(hint) in (types.UnionType, typing.Union)
+        default = field.default
         kinds = tuple(typing.get_origin(each) or each  # tuple[float, ...] is a tuple
-                      for each in (typing.get_args(hint) if joined else (hint,))
+                      for each in typing.get_args(hints[field.name] | None)
                       if each is not type(None))
         if kinds == (float,) and type(default) is int:
             default = float(default)
@@ -176,11 +174,7 @@ def declared_fields(declaring: type) -> dict[str, Declared]:
 
 
 class TablesError(ValueError):
-    """Faults of several tables: ``lines`` begin with what follows the name of the tables."""
-
-    def __init__(self, expected: str, lines: Sequence[str]) -> None:
-        super().__init__(expected)
-        self.lines = tuple(lines)
+    """Faults of several tables: lines that begin with what follows the name of the tables."""
 
 
 def check_table(
@@ -202,7 +196,7 @@ def check_table(
         try:
             values[key] = declared[key].check(value)
         except TablesError as faults:
-            lines += [f"{key}{line}" for line in faults.lines]
+            lines += [f"{key}{line}" for line in faults.args]
         except ValueError as error:
             lines.append(f"{plain(key)} = {shown(value)}: expected {error}")
     lines += [

@@ -112,19 +112,8 @@ class RunError(SweepError):
 class MachineFaultError(RunError):
     """A fault of a machine, which no scene's data can cause: it is not a result of the scene.
 
-    Parameters
-    ----------
-    fault
-        One line: "OSError: [Errno 28] No space left on device".
-    machine
-        The name of the machine.
+    It names the machine and the fault (`sweep.messages.local_fault`).
     """
-
-    def __init__(self, fault: str, machine: str) -> None:
-        self.fault, self.machine = fault, machine
-
-    def __str__(self) -> str:
-        return f"machine fault on {self.machine}: {self.fault}"
 
 
 class PluginError(SweepError):

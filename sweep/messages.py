@@ -16,12 +16,13 @@ import json
 import math
 import os
 import shlex
+import socket
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sweep.errors import PipelineError
+from sweep.errors import MachineFaultError, PipelineError
 
 #: Faults that are listed; the others are counted.
 MAX_FAULTS = 20
@@ -47,6 +48,11 @@ def plain(text: object, most: int = MAX_QUOTE_LENGTH) -> str:
     text = str(text)
     cut = text if len(text) <= most else text[: most - 3] + "..."
     return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in cut)
+
+
+def local_fault(fault: str) -> MachineFaultError:
+    """Return the error that names a fault of this machine."""
+    return MachineFaultError(f"machine fault on {socket.gethostname()}: {plain(fault, 300)}")
 
 
 def exception_line(error: BaseException) -> str:
@@ -92,9 +98,7 @@ def label(value: Any) -> str:
     >>> label((-0.3, 0.1)), label("ippe"), label(True)
     ('[-0.3, 0.1]', 'ippe', 'True')
     """
-    if isinstance(value, tuple):
-        return "[" + ", ".join(f"{item!r}" for item in value) + "]"
-    return value if isinstance(value, str) else repr(value)
+    return str(list(value) if isinstance(value, tuple) else value)
 
 
 #: Names of a folder among which a similar one is searched.

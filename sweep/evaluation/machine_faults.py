@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import pickle
-import socket
 import sys
 from collections.abc import Iterator
 from typing import Any
 
 from sweep.errors import MachineFaultError, SweepError
-from sweep.messages import exception_line, plain
+from sweep.messages import exception_line, local_fault
 
 # --------------------------------------------------------------------------------------------------
 # Exceptions that a scene's data cannot cause: faults of the machine, which are never results.
@@ -23,9 +22,6 @@ MACHINE_FAULTS: tuple[type[Exception], ...] = (
     OSError, MemoryError, ImportError, EOFError, pickle.PickleError,
 )
 
-#: Characters of an exception that a message quotes.
-MAX_FAULT_LENGTH = 300
-
 
 def machine_fault(error: BaseException) -> MachineFaultError | None:
     """Return the fault of this machine that an exception tells of, or None.
@@ -37,8 +33,8 @@ def machine_fault(error: BaseException) -> MachineFaultError | None:
     --------
     >>> machine_fault(ValueError("singular matrix")) is None
     True
-    >>> machine_fault(MemoryError()).fault
-    'MemoryError'
+    >>> str(machine_fault(MemoryError())).endswith(": MemoryError")
+    True
     """
     if isinstance(error, MachineFaultError):
         return error
@@ -59,11 +55,6 @@ def _chain(error: BaseException | None) -> list[BaseException]:
         chain.append(error)
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     return chain
-
-
-def local_fault(fault: str) -> MachineFaultError:
-    """Return the error that names the fault of this machine."""
-    return MachineFaultError(plain(fault, MAX_FAULT_LENGTH), socket.gethostname())
 
 
 def raise_machine_fault(error: BaseException) -> None:

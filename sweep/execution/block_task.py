@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sweep.errors import MachineFaultError, StoreError, StoreReplacedError
 from sweep.evaluation.block import run_cells, warm_up
-from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
+from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution import TIME_LIMIT_S
 from sweep.experiment.grid import TRIAL, Axis, Block
@@ -28,6 +28,7 @@ from sweep.experiment.sampling import StoppingRule
 from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
 from sweep.measure.flags import DetectionStatus, EstimateStatus, flag_counts
+from sweep.messages import local_fault
 from sweep.processor import processor
 from sweep.sampling.rules import Decider, Decision
 from sweep.store import blocks

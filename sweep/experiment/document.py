@@ -268,7 +268,7 @@ class Reading(Grid):
         try:
             yield
         except TablesError as error:
-            self.tell(f"{path}{line}" for line in error.lines)
+            self.tell(f"{path}{line}" for line in error.args)
         except ValueError as error:
             if key not in self.unread:
                 self.fault(path, value, str(error))

@@ -241,7 +241,7 @@ def _precision(value: Any) -> tuple[tuple[str, float], ...]:
         raise ValueError("how well quantities are to be known, such as { detection_rate = 0.02 }")
     widths, lines = check_table(_keys(**dict.fromkeys(value, _half_width)), value, "")
     if lines:
-        raise TablesError("half-widths", [f".{line}" for line in lines])
+        raise TablesError(*(f".{line}" for line in lines))
     return tuple(sorted(widths.items()))
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sweep.errors import PluginError
 from sweep.evaluation.block import run_cells
-from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
+from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure
 from sweep.experiment.pipeline import Pipeline
@@ -19,6 +19,7 @@ from sweep.isolation.child_process import Child, ChildDiedError, ChildError, Chi
 from sweep.measure.detectors import PluginSetting, make_detector
 from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.messages import local_fault
 from sweep.store.blocks import selected
 from sweep.typing import Masks
 

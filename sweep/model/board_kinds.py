@@ -55,7 +55,7 @@ def table_reader(
         lines = [f"[{number}].{line}" for number, (_, faults) in enumerate(checked)
                  for line in faults]
         if lines:
-            raise TablesError(expected, lines)
+            raise TablesError(*lines)
         return tuple(tuple(row.values()) for row, _ in checked)
 
     return read

@@ -114,7 +114,7 @@ def test_block_that_ends_its_process_each_time_is_named(tmp_path, monkeypatch):
     (ZeroDivisionError("no"), RunError,
      r"1 blocks failed\n  block 0-2,0-6: ZeroDivisionError: no"),
     (StoreReplacedError("moved"), StoreReplacedError, "moved"),
-    (MachineFaultError("full", "here"), RunError, "0-2,0-6: machine fault on here: full"),
+    (MachineFaultError("fault on here: full"), RunError, "0-2,0-6: fault on here: full"),
 ])
 def test_block_that_fails_is_named(raised, error, reason, tmp_path, monkeypatch):
     monkeypatch.setattr(executors, "compute_block", mock.Mock(side_effect=raised))

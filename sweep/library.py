@@ -24,15 +24,7 @@ if TYPE_CHECKING:
     from sweep.integrity import verification
     from sweep.photographs import prepare
     from sweep.plugins import loading
-    from sweep.report import (
-        error_model_file,
-        figure,
-        findings,
-        output_file,
-        report_data,
-        scenes,
-        table,
-    )
+    from sweep.report import figure, findings, output_file, report_data, scenes, table
     from sweep.sampling import rules
     from sweep.store import lifecycle, locations, lock
     from sweep.tradeoff import choice_search

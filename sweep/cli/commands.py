@@ -492,7 +492,7 @@ def report(
     form : --format
         One HTML page, or Markdown with a folder of figures (default: by FILE's suffix).
     figures : --figures DIR
-        Also write each figure into DIR, as SVG and PNG.
+        Also write each figure into DIR, as SVG and PNG, and each scene as PNG.
     requirements : --require REQUIREMENT
         What is required, in quotes: 'detection >= 0.99', 'range_error_p95_percent <= 1'; the
         report begins with whether it is met; may be repeated (default: the section [require] of
@@ -704,11 +704,11 @@ def error_model(
     """
     outputs = error_model or ["error_model.json"]
     for output in outputs:
-        library.error_model_file.check_error_model_file(output)
+        library.findings.check_error_model_file(output)
     data = library.report_data.read_report_data(store)
     results = library.findings.selected(data.results, at, data.pipeline)
     data = dataclasses.replace(data, results=results)
-    return library.error_model_file.model_findings(data, outputs)
+    return library.findings.model_findings(data, outputs)
 
 
 @command("answers", "pipelines/calibration/README.md", {

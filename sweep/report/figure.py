@@ -269,7 +269,7 @@ class Panel:
             axes.tick_params(axis="y", length=0)
         else:
             x = np.unique(np.concatenate([line.at for line in self.lines]))
-            set_ends(axes, "x", x, margin=0.05, logarithmic=is_logarithmic(x))
+            set_ends(axes, "x", x, margin=0.05, logarithmic=is_logarithmic(x) and x[0] > 0)
             axes.set_xlabel(self.place)
             if 0 < x.size <= MAX_OWN_TICKS and not any(line.texts for line in self.lines):
                 axes.set_xticks(x, coordinates(x.tolist()))
@@ -362,19 +362,12 @@ LOGARITHMIC_FROM = 6
 FLOOR_RATIO = 1e-6
 
 
-def spans(values: Floats, ratio: float) -> bool:
-    """Return whether no value is below 0 and the positive ones span more than a ratio."""
+def is_logarithmic(values: Floats) -> bool:
+    """Return whether no value is below 0 and the positive ones span a large ratio."""
     finite = values[np.isfinite(values)]
     positive = finite[finite > 0]
-    return bool(positive.size and finite.min() >= 0 and positive.max() > ratio * positive.min())
-
-
-def is_logarithmic(values: Floats) -> bool:
-    """Return whether an axis is logarithmic: its values lie more evenly on such a scale."""
-    if not (spans(values, 5) and (values > 0).all()):
-        return False
-    steps, factors = (np.diff(each) for each in (np.unique(values), np.log(np.unique(values))))
-    return bool(np.std(factors) / np.mean(factors) <= np.std(steps) / np.mean(steps))
+    return bool(positive.size and finite.min() >= 0
+                and positive.max() > LOGARITHMIC_FROM * positive.min())
 
 
 def set_scale(
@@ -384,16 +377,16 @@ def set_scale(
 
     ``name``: "x" or "y".
 
-    Shares in percent have always the same axis. One with a reference at 0 is linear.
+    One with a reference at 0 is linear.
     """
     axes.set(**{f"{name}label": curve.heading})
-    if curve.share:
+    if curve.scale == 100:  # shares have always the same axis
         axes.set(**{f"{name}lim": SHARES, f"{name}ticks": [0, 25, 50, 75, 100]})
         return SHARES
     level = [] if curve.level is None else [curve.level]
     values = np.concatenate([*(line.values for line in lines), level])
     ends = np.concatenate([end for line in lines for end in (line.low, line.high)])
-    logarithmic = spans(values, LOGARITHMIC_FROM) and level != [0]
+    logarithmic = is_logarithmic(values) and level != [0]
     if logarithmic:
         positive = values[np.isfinite(values) & (values > 0)]
         lowest = max(positive.min(), FLOOR_RATIO * positive.max())

@@ -1,6 +1,6 @@
-"""Questions about stores, and their findings: `require`, `size`, `limit`, `compare`, `tradeoff`.
+"""Questions about stores, and their findings: the lines, tables, figures and JSON of decisions.
 
-Each is decided elsewhere; here are its lines, tables, figures and JSON.
+`require`, `size`, `limit`, `compare`, error models, calibrations, `tradeoff`.
 """
 
 from __future__ import annotations
@@ -8,45 +8,40 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
-from sweep.analysis import comparisons, dataset, simulation_gap
+from sweep.analysis import comparisons, dataset, error_models, simulation_gap
 from sweep.analysis import requirements as judged
+from sweep.analysis.error_models import CONDITIONS, PREDICTORS, QUANTITIES, Use, cell_edges
+from sweep.analysis.estimator import INTERVAL
 from sweep.analysis.requirements import CONFIDENCE, Cause, Decision, Reach, Verdict, described
 from sweep.errors import ArgumentError, check_positive, path_of, texts_of
 from sweep.execution.progress import progress_display, stage_display
 from sweep.execution.runner import execute
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.pipeline import parse_selection
-from sweep.messages import label, nearest, notice, quoted
+from sweep.messages import label, nearest, notice, quoted, to_json
 from sweep.plugins.loading import is_recording
 from sweep.report import table as tables
 from sweep.report.figure import Figure, write_figure
-from sweep.report.output_file import figure_file
-from sweep.report.report_data import read_report_data, trade_lines
-from sweep.report.table import (
-    Column,
-    Findings,
-    Table,
-    Value,
-    caption_of,
-    coordinate,
-    number,
-    sentences,
-    table_of,
-)
+from sweep.report.output_file import check_output_file, figure_file, write_output_file
+from sweep.report.report_data import ReportData, read_report_data, trade_lines
+from sweep.report.table import Column, Findings, Table, Value, coordinate, number, table_of
 from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
 from sweep.tradeoff.measurement import measure_trade
 from sweep.tradeoff.pareto import CRITERIA, mark_front
 from sweep.tradeoff.pareto import UNITS as ERRORS
 from sweep.typing import Integers
+from sweep.version import __version__
 
 if TYPE_CHECKING:
     from sweep.analysis.requirements import Answer
@@ -58,12 +53,8 @@ WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "
 
 UNITS = {"": "", "1": "", "percent": " %", "degree": "\u00b0"}
 
-#: Decision -> exit status of a command.
-STATUS = {Decision.met: 0, Decision.not_met: 1, Decision.undecided: tables.UNDECIDED,
-          Decision.not_applicable: tables.UNDECIDED}
-
-#: Conditions that JSON lists.
-MAX_ROWS = 500
+#: Decision -> exit status of a command; of the others `UNDECIDED`.
+STATUS = {Decision.met: 0, Decision.not_met: 1}
 
 # --------------------------------------------------------------------------------------------------
 # Whether requirements are met: a row for each with its worst condition, and rows for conditions.
@@ -138,17 +129,17 @@ def require(
          for each in worse], words=True)]
     if table is not None:
         parts.append(condition_table(found, table, every=every))
-    if per is None and list(stored.require_per) != axes and axes:
-        parts.append(f"at each value of {', '.join(axes)}; --per '' pools all")
-    if pooled:
-        parts.append(f"pooled over {', '.join(pooled)}; --per keeps axes apart as conditions")
+    parts.append(f"conditions (--per): each value of {', '.join(axes) or 'no axis'}; pooled over "
+                 f"{', '.join(pooled) or 'none'}")
     return Findings(
         parts, {
             "decision": decision, "per": axes, "pooled": pooled, "against": worse,
             "requirements": [
-                {**dataclasses.asdict(each), "failing": [] if table is None else
-                 conditions_of(each, table)[:MAX_ROWS]} for each in found]},
-        table, STATUS[decision], (more_draws(found, results, path_of("store", store)), ""))
+                {**dataclasses.asdict(each),
+                 "failing": [] if table is None else conditions_of(each, table)}
+                for each in found]},
+        table, STATUS.get(decision, tables.UNDECIDED),
+        (more_draws(found, results, path_of("store", store)), ""))
 
 
 def selected_store(
@@ -337,7 +328,7 @@ def choice_findings(choice: Choice) -> Findings:
         [alternatives(choice),
          (f"{choice.poses:,} poses; {choice.most_trials:,} trials of every cell, which the hardest "
           f"one took, are {choice.grid_poses:,} poses ({factor:.1f} times as many)")],
-        as_json(choice), None, STATUS[choice.decision],
+        as_json(choice), None, STATUS.get(choice.decision, tables.UNDECIDED),
         (f"sweep report {quoted(choice.store)}", ""))
 
 
@@ -462,19 +453,17 @@ def limit_figure(limits: xr.Dataset) -> Figure:
 
     They are drawn against the first axis of conditions that has numbers.
     """
-    along, names = str(limits.attrs["along"]), dimensions(limits)
-    dims = sorted((name for name in names if limits.sizes[name] > 1),
-                  key=lambda name: limits[name].dtype.kind in "fiu")
-    limits = limits.isel({name: 0 for name in names if name not in dims})
-    # At no value there is no limit, and no interval is drawn.
-    drawn = limits[["value", "low", "high"]].where(limits["reach"] != Reach.never).drop_vars(
-        along, errors="ignore")
-    drawn = drawn.rename({"low": "value_low", "high": "value_high"})
-    column = Column(f"limit of {tables.axis_label(limits, along)}", "value")
+    heading = f"limit of {tables.axis_label(limits, str(limits.attrs['along']))}"
     title = f"Limit of {' and '.join(map(str, limits.attrs['require']))}"
-    *others, x = [tables.axis_label(limits, name) for name in dims] or [""]
-    return Figure("limit", title, "", table_of(drawn, title, dims, [column], limits), [column], x,
-                  others[-1] if others else "")
+    dims = sorted((name for name in dimensions(limits) if limits.sizes[name] > 1),
+                  key=lambda name: limits[name].dtype.kind in "fiu")
+    labels = [tables.axis_label(limits, name) for name in dims]
+    # At no value there is no limit, and no interval is drawn.
+    rows = [[*map(row["condition"].get, dims), None if row["reach"] == Reach.never.name else
+             Value(row["value"], row["low"], row["high"])] for row in limit_rows(limits)]
+    *others, x = labels or [""]
+    return Figure("limit", title, "", Table.of(title, [*labels, heading], rows, stub=len(dims)),
+                  [Column(heading, "value")], x, others[-1] if others else "")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -557,6 +546,201 @@ def gap_figure(gap: xr.Dataset) -> Figure:
     title = "Photographs and simulation, with 95 % intervals"
     return Figure("gap", title, "", table_of(gap, title, [*dims, "source"], columns), columns,
                   binned[-1] if binned else "", "source")
+
+
+# --------------------------------------------------------------------------------------------------
+# Error models of a store: their table and their JSON.
+
+#: What every file says: schema, frame, formula, and what the errors are.
+ERROR_MODEL = Path(__file__).parent / "templates" / "error_model.json"
+
+#: Variables of the models that the file has of each quantity.
+OF_QUANTITIES = (
+    *(f"{name}{end}" for name in ("sigma", "bias") for end in INTERVAL), "knots",
+    "coverage")
+
+#: Of the usual rule for one tag: sigma = 0.02 d² metres.
+RULE_M = 0.02
+
+#: Warnings of every model.
+ALWAYS = (
+    "sigma is of poses that are not flipped: where flips are not rejected, flip_rate counts too",
+    "azimuth, roll and direction of the bearing are pooled; other cameras, markers, light differ",
+)
+
+
+def check_error_model_file(path: str) -> None:
+    """Check that a file is to hold JSON.
+
+    Raises
+    ------
+    ArgumentError
+        If its name ends in another suffix.
+    """
+    if Path(path).suffix.lower() != ".json":
+        raise ArgumentError(
+            "error_model", path, "expected a file that ends in .json; pipelines/pose_errors.py "
+            "reads it, and sweep.analysis.model_covariance gives covariances for ROS")
+
+
+def error_model_document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a file; NaN and infinities are null.
+
+    Parameters
+    ----------
+    models
+        As `sweep.analysis.error_models` returns them.
+    facts
+        Source of the models: ``store``, ``title``, ``fingerprint``, ``camera``, ``pipeline``.
+    """
+    edges = {name: cell_edges(models, name).tolist() for name in PREDICTORS}
+    knots = {name: models[name].values.tolist() for name in PREDICTORS}
+    return {
+        **json.loads(ERROR_MODEL.read_text(encoding="utf-8")), "sweep": __version__, **facts,
+        "units": {name: each.units for name, each in CONDITIONS.items()},
+        "conditions": {name: each.words for name, each in CONDITIONS.items()},
+        "flags": {each.name: each.meaning for each in Use},
+        "warnings": warnings_of(models),
+        "models": [
+            {
+                "configuration": configuration,
+                "side_px_times_distance_m": None if models.attrs["focal_size_varies"] else
+                models.attrs["focal_size_px_m"],
+                "region": [dict(zip(("weights", "low", "high"), each, strict=True))
+                           for each in zip(*(model[name].values.tolist() for name in (
+                               "direction_weight", "region_low", "region_high")), strict=True)],
+                "knots": knots,
+                "knots_u": [CONDITIONS[name].scaled(values).tolist()
+                            for name, values in knots.items()],
+                "cells": edges,
+                "cells_u": [CONDITIONS[name].scaled(ends[1:-1]).tolist()
+                            for name, ends in edges.items()],
+                **{name: model[name].values.tolist()
+                   for name in ("looked_for", "solved_rate", "flip_rate", "judged")},
+                "quantities": {name: _quantity(model.sel(quantity=name)) for name in QUANTITIES},
+            }
+            for configuration, _, model in models_apart(models)
+        ],
+    }
+
+
+def _quantity(model: xr.Dataset) -> dict[str, Any]:
+    """Return the numbers for a reader's formula, and all variables, of one quantity."""
+    metres = str(model["quantity"].item()) in QUANTITIES[:3]
+    scale = model["distance_m"].values[:, None, None] if metres else 1.0
+    names = np.array([Use(flag).name for flag in model["use"].values.ravel()], dtype=object)
+    return {
+        "unit": "m" if metres else "radian",
+        "ln_sigma": np.log(model["sigma"].values).tolist(),
+        "bias_u": (model["bias"].values / scale).tolist(),
+        **{name: model[name].values.tolist() for name in OF_QUANTITIES},
+        "use": names.reshape(model["use"].shape).tolist(),
+    }
+
+
+def models_apart(models: xr.Dataset) -> list[tuple[dict[str, Any], str, xr.Dataset]]:
+    """Return the values of the axes by which models are kept apart, these in words, and each."""
+    dims = [str(dim) for dim in models["knots"].dims if dim not in ("quantity", "predictor")]
+    return [(at, described(at, " = ") or "the configuration", model)
+            for at, model in dataset.each_cell(models, dims)]
+
+
+def warnings_of(models: xr.Dataset) -> list[str]:
+    """Return sentences on where the models must not be used, beside the flags of the cells."""
+    lines = []
+    for _, name, model in models_apart(models):
+        use = model["use"].values
+        counted = use[:, (use != Use.no_poses).any(axis=0)]
+        parts = [f"{100 * float((counted == flag).mean()):.0f} % {flag.name}" for flag in Use
+                 if flag != Use.no_poses and (counted == flag).any()]
+        lines.append(f"{name}: of {counted.size:,} cells (times errors): {', '.join(parts)}")
+    for name in PREDICTORS:
+        if models.sizes[name] == 1 and not (
+            name == "side_px" and models.sizes["distance_m"] > 1
+            and not models.attrs["focal_size_varies"]):
+            value = float(models[name][0])
+            lines.append(f"{name} did not vary ({value:.4g} {CONDITIONS[name].units}): the models "
+                         "hold there alone")
+    bearing = models["direction_weight"].values[:, list(CONDITIONS).index("bearing_deg")] == 1
+    low, high = (float(extreme(models[f"region_{end}"].values[..., bearing]))
+                 for end, extreme in (("low", np.min), ("high", np.max)))
+    lines.append(f"bearings from {low:.4g} to {high:.4g} degree: the models hold there alone")
+    return [*lines, *ALWAYS]
+
+
+def model_findings(data: ReportData, paths: Sequence[str]) -> Findings:
+    """Write the error models of a store; return their table and warnings.
+
+    Parameters
+    ----------
+    data
+        The store.
+    paths
+        Files whose names end in ``.json``.
+
+    Raises
+    ------
+    ArgumentError
+        If one ends in another suffix.
+    StoreError
+        If a file cannot be written.
+    DatasetError
+        As `sweep.analysis.error_models`.
+    """
+    for path in paths:
+        check_error_model_file(path)
+        check_output_file(Path(path))
+    models = error_models(data.results)
+    content = error_model_document(models, {
+        "store": data.store, "title": data.pipeline.heading,
+        "camera": data.pipeline.facts.camera_line,
+        "fingerprint": dict(data.run_metadata.get("fingerprint", {})),
+        "pipeline": data.pipeline.text,
+    })
+    for path in paths:
+        write_output_file(Path(path), f"{to_json(content, indent=1)}\n".encode())
+    return Findings(
+        [error_model_table(models), *(f"- {line}" for line in warnings_of(models))],
+        content, models, 0,
+        (f"look at {', '.join(paths)}", "sigma and bias anywhere in the store's domain"))
+
+
+#: Most knots of each condition that the table shows.
+SHOWN = dict(zip(PREDICTORS, (4, 3, 3), strict=True))
+
+
+def error_model_table(models: xr.Dataset) -> Table:
+    """Return a table with a row for some knots at which each configuration has poses."""
+    places = {name: np.unique(np.linspace(0, models.sizes[name] - 1, most).round().astype(int))
+              for name, most in SHOWN.items()}
+    some = models.isel(places)
+    cells = {f"cell_{name}": (name, np.searchsorted(
+        cell_edges(models, name)[1:-1], some[name].values, side="right")) for name in PREDICTORS}
+    use = some["use"].isel({name: xr.DataArray(at, dims=dim) for name, (dim, at) in cells.items()})
+    # Positions in mm, rotations in degrees.
+    scale = xr.DataArray([1e3] * 3 + [float(np.degrees(1.0))] * 3, dims="quantity")
+    columns = {f"{quantity}{end}": (scale * some[f"sigma{end}"]).sel(quantity=quantity, drop=True)
+               for quantity in QUANTITIES for end in INTERVAL}
+    sigma_z, bias_z = (some[name].sel(quantity="z", drop=True) for name in ("sigma", "bias"))
+    table = xr.Dataset(columns).assign(
+        bias=1e3 * bias_z, rule=RULE_M * some["distance_m"]**2 / sigma_z,
+        seen=(use != Use.no_poses).any("quantity").astype(int),
+        use=xr.apply_ufunc(_use, use, input_core_dims=[["quantity"]], vectorize=True,
+                           output_dtypes=[object]))
+    kept = [str(dim) for dim in models["knots"].dims if dim not in ("quantity", "predictor")]
+    return table_of(
+        table, "Standard deviation (95 % interval) and bias of the error of poses without flips, "
+        "in the sight frame: z along the line of sight", [*kept, *PREDICTORS],
+        [Column("held-out check", "use"), *(
+            Column(f"{quantity.replace('_', ' ')}, {'deg' if 'rotation' in quantity else 'mm'}",
+                   quantity) for quantity in QUANTITIES),
+         Column("bias of z, mm", "bias"), Column("0.02 d² / sigma z", "rule")],
+        models, counted="seen")
+
+
+def _use(flags: Integers) -> str:
+    """Return the flags of the six errors in words."""
+    return ", ".join(Use(int(flag)).name.replace("_", " ") for flag in np.unique(flags))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -727,10 +911,16 @@ def measure_tradeoff(
         trade, 0, (f"sweep report {quoted(store)}", "with these costs and a figure of them"))
 
 
-def trade_columns(trade: xr.Dataset, criterion: str) -> tuple[xr.Dataset, list[Column]]:
-    """Return a trade with its front and covariances as columns, and the columns of its table.
+def tradeoff_table(trade: xr.Dataset, criterion: str) -> Table:
+    """Return a row for each condition and configuration, the cheapest first.
 
-    Columns without any value are left out, but for the cost and the criterion.
+    Times are in ms a frame, rotations in degrees, ranges in percent; values have their 95 %
+    intervals. Columns without any value are left out, but for the cost and the criterion.
+
+    Raises
+    ------
+    KeyError
+        If ``trade`` lacks ``cost_ms`` or the criterion.
     """
     errors = (f"{quantity}_{statistic}_{unit}" for quantity, unit in ERRORS.items()
               for statistic in ("bias", "rmse", "rmse_unflipped", "median", "p95", "p99"))
@@ -739,43 +929,27 @@ def trade_columns(trade: xr.Dataset, criterion: str) -> tuple[xr.Dataset, list[C
         *(f"{quantity}_efficiency" for quantity in ERRORS)))
     columns = [FRONT, MS, Column("x baseline", "cost_ratio"), *map(tables.column, names),
                Column("NEES", "nees_mean")]
-    marked = mark_front(trade, criterion)
+    marked = mark_front(trade, criterion).rename(treatment="configuration")
     for level in marked["level"].values.tolist() if "covariance_coverage" in marked else ():
         name = f"covered_{level:g}"
         marked[name] = marked["covariance_coverage"].sel(level=level, drop=True)
         columns.append(Column(f"in {100 * level:g} % ellipsoid, %", name, 100))
     if "covariance_trusted" in marked:
-        marked["trusted"] = marked["covariance_trusted"].astype(object).where(
+        marked["covariance_trusted"] = marked["covariance_trusted"].astype(object).where(
             marked["nees_count"] > 0, None)
-        columns.append(Column("covariance trusted", "trusted"))
-    return marked, [each for each in columns if each.variable in (MS.variable, criterion) or (
-        each.variable in marked and bool(marked[each.variable].notnull().any()))]
-
-
-def tradeoff_table(trade: xr.Dataset, criterion: str) -> Table:
-    """Return a row for each condition and configuration, the cheapest first.
-
-    Times are in ms a frame, rotations in degrees, ranges in percent; values have their 95 %
-    intervals. Columns whose variables ``trade`` lacks are left out.
-
-    Raises
-    ------
-    KeyError
-        If ``trade`` lacks ``cost_ms`` or the criterion.
-    """
-    marked, columns = trade_columns(trade, criterion)
-    dims = [*(str(dim) for dim in trade["cost_ms"].dims if dim != "treatment"), "configuration"]
-    marked = marked.rename(treatment="configuration")
+        columns.append(tables.column("covariance_trusted"))
+    dims = [*(str(dim) for dim in marked["cost_ms"].dims if dim != "configuration"),
+            "configuration"]
     table = table_of(
-        marked, "Cost and accuracy, the cheapest first, with 95 % intervals", dims, columns)
+        marked, "Cost and accuracy, the cheapest first, with 95 % intervals", dims,
+        [each for each in columns if each.variable in (MS.variable, criterion) or (
+            each.variable in marked and bool(marked[each.variable].notnull().any()))])
     cost = np.ravel(marked["cost_ms"].transpose(*dims))
     order = np.lexsort((cost, np.arange(cost.size) // marked.sizes["configuration"]))
     return dataclasses.replace(table, frame=table.frame.iloc[order])
 
 
-def trade_figure(
-    trade: xr.Dataset, criterion: str = "", lines: Sequence[str] = ()
-) -> Figure:
+def trade_figure(trade: xr.Dataset, criterion: str = "", lines: Sequence[str] = ()) -> Figure:
     """Return cost, ms a frame, against an error, a panel for each condition.
 
     Parameters
@@ -790,8 +964,8 @@ def trade_figure(
     criterion = criterion or str(trade.attrs.get("criterion", CRITERION))
     shown = tables.column(criterion)
     return Figure(
-        "trade", "Cost and accuracy", sentences(
-            caption_of("trade", heading=shown.heading, poses=trade.attrs.get("poses", 0)),
+        "trade", "Cost and accuracy", tables.sentences(
+            tables.caption_of("trade", heading=shown.heading, poses=trade.attrs.get("poses", 0)),
             *(f"{line}." for line in lines)),
         tradeoff_table(trade, criterion), [shown], MS.heading, FRONT.heading,
         labels="configuration")

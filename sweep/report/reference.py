@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
+from typing import Any
 
 import pandas as pd
 
@@ -53,14 +54,14 @@ def reference(*names: str) -> Findings:
     if chosen:
         tables.append(_parameters("parameters", [PARAMETERS[name] for name in chosen]))
     if not names:
-        tables = [_table("subjects", ({"subject": name, "rows": str(len(make().frame))}
+        tables = [_table("subjects", ({"subject": name, "rows": len(make().frame)}
                                       for name, make in TABLES.items()))]
     then = ("", "") if names else ("sweep reference NAME", "prints a table, or a parameter")
     return Findings(
         tables, {table.caption: table.as_json()["rows"] for table in tables}, then=then)
 
 
-def _table(caption: str, rows: Iterable[dict[str, str]]) -> Table:
+def _table(caption: str, rows: Iterable[dict[str, Any]]) -> Table:
     """Return a table of rows by their headings."""
     return Table(caption, pd.DataFrame(list(rows), dtype=object), words=True)
 
@@ -100,26 +101,24 @@ def _presence(variable: Variable) -> str:
     return f"{'if' if rule.number == 'always' else 'only if'} {rule.flag} is {names}"
 
 
-YES = {True: "yes", False: "no"}
-
 #: Subject -> the function that makes its table.
 TABLES: dict[str, Callable[[], Table]] = {
     **{section: partial(_section, section) for section in SECTIONS},
     "effects": lambda: _table("effects, in physical order", ({
         "effect": each.label, "switched on by": each.switch, "absent at": each.off_text,
-        "acts on": each.step, "random": YES[each.random], "in the bound": YES[each.in_bound],
+        "acts on": each.step, "random": each.random, "in the bound": each.in_bound,
         "meaning": PARAMETERS[each.switch].meaning} for each in EFFECTS)),
     "solvers": lambda: _table("choices of the estimator's solver", ({
         "solver": name, "meaning": each.meaning,
         "from": "a file" if each.recorded else "pixels" if each.needs_images else "corners",
-        "guarded": YES[each.guarded]} for name, each in SOLVERS.items())),
+        "guarded": each.guarded} for name, each in SOLVERS.items())),
     "variables": lambda: _table("variables of the dataset", ({
         "variable": each.name, "stage": each.stage.name,
         "dimensions beside the axes": ", ".join(each.inner), "unit": each.units,
         "meaning": each.meaning, "number": _presence(each)} for each in VARIABLES.values())),
     "flags": lambda: _table("flags", ({
-        "variable": name, "value": str(int(flag)), "flag": flag.name, "meaning": flag.meaning,
-        "counted in rates": YES[flag.counted]} for name, flags in FLAGS.items() for flag in flags)),
+        "variable": name, "value": int(flag), "flag": flag.name, "meaning": flag.meaning,
+        "counted in rates": flag.counted} for name, flags in FLAGS.items() for flag in flags)),
     "statistics": lambda: _table("variables of error_statistics", (
         {"variable": name, "meaning": meaning} for name, meaning in (
             *((each.name, each.meaning) for each in POSE_STATISTICS),

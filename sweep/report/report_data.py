@@ -289,11 +289,6 @@ class Configurations:
     wrong: list[bool]
     summary: xr.Dataset
 
-    @property
-    def several(self) -> bool:
-        """Whether there is more than one."""
-        return len(self.names) > 1
-
 
 #: What tells configurations apart, and whether more of it is better.
 RANKS = {"detection_rate": False, "solved_rate": False, "rotation_rmse_deg": True,
@@ -507,7 +502,7 @@ class Comparison:
         known, columns = self.known, [Column("n", "looked_for"), *CARDS]
         caption, headings = "Configurations, with 95 % intervals", [CONFIGURATION]
         cells = [each.cells(known.summary) for each in columns]
-        if known.several:
+        if len(known.names) > 1:
             verdicts = [verdict_words(pair) for pair in self.differences]
             verdicts[self.best] = "best" if all(
                 self.verdict(k) > 0 or known.wrong[k] for k in range(len(known.names))
@@ -627,23 +622,21 @@ def trade_lines(data: ReportData, trade: xr.Dataset, budget_ms: float | None = N
         here = dataclasses.replace(data, results=results.isel(keep), compared={})
         known = configurations(here, targets=False)
         names, cost = known.names, part["cost_ms"].reindex(treatment=known.names).values.tolist()
-        usable = [k for k in range(len(names)) if not known.wrong[k] and np.isfinite(cost[k])]
+        usable = [k for k in np.argsort(cost, kind="stable").tolist()
+                  if not known.wrong[k] and np.isfinite(cost[k])]
         within = [k for k in usable if budget_ms is None or cost[k] <= budget_ms]
-        line = f"{label}: " if label else ""
         if within:
-            found = comparison(here, tuple(within))
-            cheapest = min((k for k in within if k == found.best or found.verdict(k) <= 0),
-                           key=cost.__getitem__)
-            line += "" if budget_ms is None else f"within {budget_ms:g} ms a frame: "
-            line += f"{found.name}, {number(cost[found.best])} ms a frame"
-            if cheapest != found.best:
-                line += (f"; not shown to be worse and cheaper is {names[cheapest]}, "
-                         f"{number(cost[cheapest])} ms")
-            line += f"; {found.line}" if found.line else ""
+            found = comparison(here, within)
+            cheapest = next(k for k in within if k == found.best or found.verdict(k) <= 0)
+            budget = "" if budget_ms is None else f"within {budget_ms:g} ms a frame: "
+            parts = [
+                f"{budget}{found.name}, {number(cost[found.best])} ms a frame",
+                f"not shown to be worse and cheaper is {names[cheapest]}, "
+                f"{number(cost[cheapest])} ms" if cheapest != found.best else "", found.line]
         else:
-            line += "nothing to recommend" if budget_ms is None else (
-                f"nothing fits {budget_ms:g} ms a frame")
-            for near in sorted(usable, key=cost.__getitem__)[:1]:
-                line += f"; the nearest is {names[near]}, {number(cost[near])} ms"
-        lines.append(line)
+            parts = [
+                "nothing to recommend" if budget_ms is None else
+                f"nothing fits {budget_ms:g} ms a frame",
+                *(f"the nearest is {names[k]}, {number(cost[k])} ms" for k in usable[:1])]
+        lines.append(": ".join(filter(None, (label, "; ".join(filter(None, parts))))))
     return lines

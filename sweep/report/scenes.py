@@ -143,7 +143,7 @@ def value_table(
     return Table.of("Values of the cell", ["variable", "value", "unit", "stored"], rows, words=True)
 
 
-#: Numbers of a variable that are written out; of more, as of boards' corners, the RMS is.
+#: Numbers of a variable that are written out; more, as of boards' corners, are counted.
 MAX_NUMBERS = 12
 
 
@@ -154,13 +154,11 @@ def _value_text(variable: Variable, value: NDArray[Any]) -> str:
                          for name, count in names.items())
     if value.size <= MAX_NUMBERS:
         return " ".join(coordinate(float(number)) for number in value.ravel())
-    known = value[np.isfinite(value)]
-    rms = f", RMS {coordinate(float(np.sqrt(np.mean(known**2))))}" if known.size else ""
-    return f"{known.size} of {value.size} numbers{rms}"
+    return f"{np.isfinite(value).sum()} of {value.size} numbers"
 
 
 # --------------------------------------------------------------------------------------------------
-# Example scenes of a store: the best, the median, the worst, a flip, and one of each failure.
+# Example scenes of a store: the best, the worst, a flip, and one of each failure.
 
 #: The rotation error of a flip that is shown exceeds this: others are hardly visible.
 MIN_FLIP_DEG = 5.0
@@ -183,23 +181,19 @@ def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
     error, area = values("rotation_error_deg").astype(np.float64), np.nan_to_num(values(AREA))
     solved = (estimate == EstimateStatus.solved) & np.isfinite(error)
     flipped = values("flipped") == Flipped.flipped
-    middle = np.median(error[solved]) if solved.any() else math.nan
     kinds = {
         "best: the smallest rotation error": (solved, -error),
-        "median rotation error of the solved": (solved, -np.abs(error - middle)),
         "worst: the largest rotation error": (solved, error),
         "worst without a flip": (solved & ~flipped, error),
         "flipped to the mirrored pose": (solved & flipped & (error > MIN_FLIP_DEG), area),
     }
     # A failure of the detection is flagged in the estimate, too: it is shown once.
-    for column, flags in ((estimate, EstimateStatus), (detection, DetectionStatus)):
-        for flag in flags:
-            if flag.counted and flag.ends and flag is not EstimateStatus.solved:
-                words = flag.name.replace("_", " ")
-                meaning = f"{flag.meaning[:1].lower()}{flag.meaning[1:]}".removesuffix(".")
-                kinds = {title: kind for title, kind in kinds.items()
-                         if title.partition(":")[0] != words}
-                kinds[f"{words}: {meaning}"] = column == flag, area
+    failures = {flag.name: (flag, column == flag) for column, flags in (
+        (estimate, EstimateStatus), (detection, DetectionStatus)) for flag in flags
+        if flag.counted and flag.ends and flag is not EstimateStatus.solved}
+    for name, (flag, mask) in failures.items():
+        meaning = f"{flag.meaning[:1].lower()}{flag.meaning[1:]}".removesuffix(".")
+        kinds[f"{name.replace('_', ' ')}: {meaning}"] = mask, area
     shape = [results.sizes[dim] for dim in dims]
     for title, (mask, merit) in kinds.items():
         rows = np.flatnonzero(mask)

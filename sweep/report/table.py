@@ -158,11 +158,6 @@ class Column(NamedTuple):
     scale: float = 1.0
     level: float | None = None
 
-    @property
-    def share(self) -> bool:
-        """Whether it is a share."""
-        return self.scale == 100
-
     def cells(self, summary: xr.Dataset | pd.DataFrame) -> list[Any]:
         """Return the cells of all values of a dataset or a frame, in its order."""
         values = np.ravel(summary[self.variable]).tolist()

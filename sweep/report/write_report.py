@@ -26,22 +26,11 @@ from sweep.experiment.parameters import Stage
 from sweep.measure.flags import BoundStatus, Flag, outcomes, present_values
 from sweep.messages import byte_count, quoted
 from sweep.report import findings, output_file, report_data
-from sweep.report.error_model_file import model_findings
+from sweep.report import table as tables
 from sweep.report.figure import MAX_DOTS, MAX_LINES, Figure, panels_file
 from sweep.report.report_data import AREA, CARDS, CONFIGURATION, IDS, Groups, ReportData, grouped
 from sweep.report.scenes import LEGEND, Scene, scenes_of
-from sweep.report.table import (
-    TEMPLATES,
-    Column,
-    Findings,
-    Table,
-    caption_of,
-    column,
-    number,
-    plural,
-    sentences,
-    table_of,
-)
+from sweep.report.table import Column, Findings, Table, caption_of, column, sentences, table_of
 from sweep.store.files import write_whole
 
 # --------------------------------------------------------------------------------------------------
@@ -143,7 +132,7 @@ MIN_DRAWN = 3
 
 def _configurations(data: ReportData) -> Figure | None:
     known = report_data.configurations(data)
-    if not known.several:
+    if len(known.names) == 1:
         return None
     covers = [
         axis.name for axis in data.pipeline.axes
@@ -376,14 +365,14 @@ def answer(data: ReportData) -> Answer:
         If the store lacks what the requirements are of.
     """
     try:
-        line, compared, tables, details, numbers = required(data) if data.require else (
+        line, compared, first, details, numbers = required(data) if data.require else (
             "", report_data.comparison(data), [], [], {})
     except DatasetError as error:
         raise StoreError(f"{data.store}: {error}") from None
     known = compared.known
     one = known.summary.isel({CONFIGURATION: compared.best})
     tiles = [_tile(one, card) for card in CARDS]
-    name = compared.name if known.several else ""
+    name = compared.name if len(known.names) > 1 else ""
     line = line or (f"{compared.line}." if compared.line else _in_numbers(tiles))
     if not int(known.summary["looked_for"].sum()):
         line = (f"The {data.pipeline.target_word} was looked for in no pose: it was visible and "
@@ -396,7 +385,7 @@ def answer(data: ReportData) -> Answer:
         caption_of("intervals", photographs=of_photographs(data.results)),
         report_data.notes_of(data, {}), data.pooled(*known.axes))
     return Answer(
-        line, notes, name, tiles, [*tables, compared.table()], [*details, *tables_of(data)],
+        line, notes, name, tiles, [*first, compared.table()], [*details, *tables_of(data)],
         {"comparison": compared.as_json(), **numbers})
 
 
@@ -495,10 +484,9 @@ COUNTED = {"detection_rate": ["looked_for"], "solved_rate": ["looked_for"], "fli
 def _in_numbers(tiles: Sequence[Mapping[str, Any]]) -> str:
     """Return the answer of a single configuration in one line."""
     detected, _, median, _, rmse, *_ = tiles
-    errors = "".join(
-        f"; {tile['name']} {tile['text']}{f' ({detail})' if (detail := tile['detail']) else ''}"
-        for tile in (median, rmse) if not math.isnan(tile["value"]))
-    return f"Detected in {detected['text']} ({detected['detail']}){errors}."
+    parts = [f"{tile['name']} {tile['text']}{f' ({detail})' if (detail := tile['detail']) else ''}"
+             for tile in (median, rmse) if not math.isnan(tile["value"])]
+    return "; ".join([f"Detected in {detected['text']} ({detected['detail']})", *parts]) + "."
 
 
 def _tile(one: xr.Dataset, column: Column) -> dict[str, Any]:
@@ -507,10 +495,10 @@ def _tile(one: xr.Dataset, column: Column) -> dict[str, Any]:
     unit = {"deg": "\u00b0"}.get(unit, f" {unit}")
     (found,) = column.cells(one)
     known = math.isfinite(found.low) and not math.isnan(found.high)
-    details = [f"{number(found.low)} to {number(found.high)}{unit}"] if known else []
+    details = [f"{tables.number(found.low)} to {tables.number(found.high)}{unit}"] if known else []
     counted = {name: int(one[name]) for name in COUNTED.get(column.variable, ())}
     details += [f"of {count:,} {of.replace('_', ' ')}" for of, count in counted.items()]
-    text = number(found.value) + (unit if math.isfinite(found.value) else "")
+    text = tables.number(found.value) + (unit if math.isfinite(found.value) else "")
     if math.isinf(found.value):
         details = ["more than half not solved"]
     return {"name": name, "text": text, "detail": ", ".join(details), **found._asdict(),
@@ -545,7 +533,7 @@ def write_report(
         "html": one page; "md": Markdown with its figures and scenes in a folder beside it, named
         as the file with ``_figures`` in place of the suffix (default: by the file's suffix).
     figures
-        Folder into which each figure is written as SVG and PNG, too.
+        Folder into which each figure is written as SVG and PNG, too, and each scene as PNG.
     error_model
         JSON files of the error models to write, too.
     command
@@ -578,7 +566,7 @@ def write_report(
     folders = [folder for folder in (beside, Path(figures) if figures else None) if folder]
     data = report_data.read_report_data(path_of("store", store), require, per, command)
     if error_model:
-        model_findings(data, error_model)
+        findings.model_findings(data, error_model)
     output_file.check_output_file(file)
     for folder in folders:
         output_file.check_output_file(folder / "figure.png" if folder.is_dir() else folder)
@@ -589,35 +577,28 @@ def write_report(
     pictures = {
         f"{figure.name}{suffix}": panels_file(figure.panels, suffix)
         for figure in drawn for suffix in PICTURES if folders}
+    pictures |= {f"scene-{number}.png": scene.picture for number, scene in enumerate(scenes, 1)
+                 if scene.picture is not None}
     text = page(data.pipeline.heading, found, provenance(data, str(file)), drawn, scenes,
                 data.require, "" if beside is None else beside.name)
     for folder in folders:
-        _write_pictures(folder, pictures)
-    if beside is not None:
-        _write_pictures(beside, {
-            f"scene-{number}.png": scene.picture for number, scene in enumerate(scenes, 1)
-            if scene.picture is not None})
+        with output_file.write_errors_explained(folder):
+            folder.mkdir(exist_ok=True)
+            for name, content in pictures.items():  # in place of files and links of these names
+                write_whole(folder / name, content)
     # Invalid Unicode, which a file's name may hold, is written as a question mark.
     output_file.write_output_file(file, text.encode("utf-8", errors="replace"))
     size = f", {byte_count(file.stat().st_size)}" if file.is_file() else ""
     then = (f"look at {file}", "")
     if data.trade is None and data.setting_axes:
         then = (f"sweep tradeoff {quoted(data.store)}", "what each configuration costs")
-    content: dict[str, Any] = {
+    numbers: dict[str, Any] = {
         "report": str(file), "figures": len(drawn), "store": data.store,
         "required": list(data.require), "per": list(data.per)}
     # Into the page's own stream a line more would not be HTML.
     lines = [] if output_file.standard_stream(file) else [
-        f"{file}: {plural(len(drawn), 'figure')}{size}", *data.warnings, found.headline]
-    return Findings(lines, content | found.as_json(), None, 0, then if lines else ("", ""))
-
-
-def _write_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
-    """Write files into a folder; files and links of their names are replaced."""
-    with output_file.write_errors_explained(folder):
-        folder.mkdir(exist_ok=True)
-        for name, content in pictures.items():
-            write_whole(folder / name, content)
+        f"{file}: {tables.plural(len(drawn), 'figure')}{size}", *data.warnings, found.headline]
+    return Findings(lines, numbers | found.as_json(), None, 0, then if lines else ("", ""))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -638,7 +619,10 @@ def provenance(data: ReportData, output: str) -> dict[str, Any]:
         "Camera": "; ".join([pipeline.facts.camera_line, *pipeline.facts.camera_notes]),
         "Run": " to ".join(str(run[name]) for name in ("created", "finished_at") if name in run),
         "Sampling": sampling_text(data.results),
-        **{name: _recorded(value) for part in ("environment", "fingerprint")
+        # Of digests the first digits.
+        **{name: ", ".join(f"{key} {text:.20}" for key, text in value.items())
+           if isinstance(value, Mapping) else str(value)
+           for part in ("environment", "fingerprint")
            for name, value in dict(run.get(part, {})).items()},
         "Report": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
     }
@@ -655,12 +639,6 @@ def provenance(data: ReportData, output: str) -> dict[str, Any]:
     }
 
 
-def _recorded(value: Any) -> str:
-    """Return what a run recorded of itself as text; of digests the first digits."""
-    return ", ".join(f"{name} {text:.20}" for name, text in value.items()) if isinstance(
-        value, Mapping) else str(value)
-
-
 # --------------------------------------------------------------------------------------------------
 # The report as one self-contained HTML page (no network, no script, no other file), or as Markdown
 # with its figures and scenes as files in a folder beside it: from the templates beside this module.
@@ -674,7 +652,7 @@ def page(
 
     With ``folder``, the name of the folder of figures and scenes, it is Markdown.
     """
-    text = TEMPLATES.get_template("page.jinja" if folder else "page.html").render(
+    text = tables.TEMPLATES.get_template("page.jinja" if folder else "page.html").render(
         title=title, answer=answer, provenance=provenance, figures=figures, scenes=scenes,
         require=require, folder=folder, legend=LEGEND)
     return text.rstrip("\n") + "\n"

@@ -21,7 +21,7 @@ from sweep.analysis.error_models import Use
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.messages import to_json
-from sweep.report import error_model_file
+from sweep.report.findings import error_model_document
 
 SIX = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
 GRID = {"distance_m": [1.0, 1.5, 2.2, 3.3, 5.0], "tilt_deg": [0.0, 20.0, 40.0, 60.0]}
@@ -229,7 +229,7 @@ def test_a_model_answers_only_in_the_joint_region_that_was_seen(name, regions):
     own = model_covariance(models, position, angles, focal / position[:, 2])
     looked_for = (results["detection"] == DetectionStatus.detected).values.ravel()
     assert np.isfinite(own.covariance.values[looked_for, 0, 0]).all()
-    document = json.loads(to_json(error_model_file.document(models, {})))
+    document = json.loads(to_json(error_model_document(models, {})))
     read_errors = reader_of_the_guide()
     for conditions, expected in ((seen, True), (unseen, False)):
         for distance, angle, side, bearing in conditions:

@@ -10,8 +10,7 @@ from support.pose_errors import poses_with_law, power_law, reader_of_the_guide
 from sweep.analysis import error_models, model_errors
 from sweep.analysis.error_models import Use
 from sweep.messages import to_json
-from sweep.report import error_model_file
-from sweep.report.error_model_file import error_model_table
+from sweep.report.findings import error_model_document, error_model_table
 
 TITLE = 'a " */ quote\\ \n #include <x> {{ 7 * 7 }} {% raw %} """ \u2028 </script> \udcff'
 ABOUT = {"store": 'runs/"odd" */ name.zarr', "title": TITLE, "fingerprint": {}}
@@ -26,7 +25,7 @@ def models():
 
 @pytest.fixture(scope="module")
 def document(models):
-    text = to_json(error_model_file.document(models, ABOUT))
+    text = to_json(error_model_document(models, ABOUT))
     assert text.isascii()
     return json.loads(text, parse_constant=pytest.fail)
 

@@ -44,9 +44,6 @@ TIMING_S = 0.2
 #: Seconds after which it is abandoned: it is known by then that blocks are small.
 TIMING_LIMIT_S = 5.0
 
-#: Share of a block's time limit after which it is, too.
-TIMING_SHARE = 1 / 8
-
 #: Most scenes of a batch.
 MAX_BATCH = 1536
 
@@ -65,15 +62,15 @@ class Timing(NamedTuple):
 
     Attributes
     ----------
-    scene_s
+    pose_s
         Mean seconds a scene, all configurations included.
     sampled
         Scenes that were timed.
     over
-        Whether these took too long and were abandoned: a scene takes about ``scene_s`` or more.
+        Whether these took too long and were abandoned: a scene takes about ``pose_s`` or more.
     """
 
-    scene_s: float
+    pose_s: float
     sampled: int
     over: bool = False
 
@@ -103,8 +100,8 @@ def _photographs(pipeline: Pipeline) -> Blocks:
         1 if axis.name == TRIAL or "photographs" in axis.columns else len(axis) for axis in axes))
 
 
-def timed(pipeline: Pipeline, budget_s: float = TIMING_S) -> Timing:
-    """Time a batch of scenes for about ``budget_s`` seconds.
+def timed(pipeline: Pipeline) -> Timing:
+    """Time a batch of scenes for about :data:`TIMING_S` seconds.
 
     One scene is computed first, so that code is compiled and caches are filled; batches grow until
     one takes as long.
@@ -113,26 +110,18 @@ def timed(pipeline: Pipeline, budget_s: float = TIMING_S) -> Timing:
     count = 1
     while True:
         spent_s, sampled = seconds_of(pipeline, count)
-        wanted = min(int(budget_s * sampled / spent_s), MAX_BATCH)
+        wanted = min(int(TIMING_S * sampled / spent_s), MAX_BATCH)
         if wanted <= 2 * count:
             return Timing(spent_s / sampled, sampled)
         count = min(wanted, GROWTH * count)
 
 
-def measure(child: Child, pipeline: Pipeline, block_limit_s: float) -> Timing:
-    """Time a batch of scenes in a child process, which ends if that takes too long.
+def measure(child: Child, pipeline: Pipeline, limit_s: float = TIMING_LIMIT_S) -> Timing:
+    """Time a batch of scenes in a child process, which ends if that takes longer than ``limit_s``.
 
     If a scene crashes or raises, or this machine is at fault, a cost is assumed: whether machines
     are is seen by their blocks.
-
-    Parameters
-    ----------
-    child, pipeline
-        The process, and the experiment.
-    block_limit_s
-        A block's timeout in seconds, of which the measurement takes a small share.
     """
-    limit_s = min(TIMING_SHARE * block_limit_s, TIMING_LIMIT_S)
     try:
         return child.call(timed, pipeline, limit_s=limit_s, grace_s=COMPILATION_LIMIT_S)
     except (ChildRaisedError, MachineFaultError):
@@ -185,20 +174,13 @@ MAX_BLOCK_SCENES = 200_000
 LARGER = 1.2
 
 
-def block_work_s(total_s: float, workers: int, time_limit_s: float | None = None) -> float:
+def block_work_s(total_s: float, workers: int) -> float:
     """Return the seconds of work in a block of a run that takes ``total_s`` of one worker.
 
-    About 2; more for large clusters and for long runs; less if there is little to do, or if the
-    user gives a time limit of which it would be too large a share.
+    About 2; more for large clusters and for long runs; less if there is little to do.
     """
     wanted = max(BLOCK_S, workers / BLOCKS_PER_S, total_s / MAX_BLOCKS)
-    share = max(MIN_BLOCK_S, total_s / (workers * BLOCKS_PER_WORKER))
-    return min(wanted, longest_block_s(time_limit_s), share)
-
-
-def longest_block_s(time_limit_s: float | None) -> float:
-    """Return the seconds of work that a block may take under the user's time limit, if any."""
-    return math.inf if time_limit_s is None else max(BLOCK_S, MAX_BLOCK_SHARE * time_limit_s)
+    return min(wanted, max(MIN_BLOCK_S, total_s / (workers * BLOCKS_PER_WORKER)))
 
 
 def block_time_limit_s(time_limit_s: float | None, work_s: float) -> float:
@@ -211,7 +193,7 @@ def block_time_limit_s(time_limit_s: float | None, work_s: float) -> float:
 
 
 def blocks_of(
-    pipeline: Pipeline, scene_s: float, workers: int, time_limit_s: float | None = None
+    pipeline: Pipeline, pose_s: float, workers: int, time_limit_s: float | None = None
 ) -> Blocks:
     """Return the blocks of a run.
 
@@ -222,29 +204,30 @@ def blocks_of(
     ----------
     pipeline
         The grid.
-    scene_s
+    pose_s
         Seconds that a scene takes.
     workers
         Threads that share the work.
     time_limit_s
-        Block timeout in seconds, if the user gave one.
+        Block timeout in seconds, if the user gave one: a block takes a small share of it.
     """
     if pipeline.shows_photographs:
         return _photographs(pipeline)
     axes, rule = pipeline.experiment.scene_axes, make_rule(pipeline)
-    total_s = pipeline.size(Stage.scene) * scene_s
+    total_s = pipeline.size(Stage.scene) * pose_s
     if rule is not None:
         # Writing a block costs as much if few of its scenes are needed.
         total_s = max(total_s * least_share(rule), WAVE_BLOCK_S * BLOCKS_PER_WORKER)
     most = max(min(MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // pipeline.experiment.bytes_of(1)), 1)
-    longest = min(max(longest_block_s(time_limit_s) / scene_s, 1), most)
-    target = min(max(int(block_work_s(total_s, workers, time_limit_s) / scene_s), 1), most)
+    if time_limit_s is not None:
+        most = min(most, max(int(max(BLOCK_S, MAX_BLOCK_SHARE * time_limit_s) / pose_s), 1))
+    target = min(max(int(block_work_s(total_s, workers) / pose_s), 1), most)
     while True:
         blocks = Blocks(tuple(map(len, axes)), _cut(axes, target, rule))
         # Blocks that fit into the axes are smaller than wanted, so that there may be more.
-        if len(blocks) <= MAX_BLOCKS or target >= int(longest):
+        if len(blocks) <= MAX_BLOCKS or target >= most:
             return blocks
-        target = min(math.ceil(LARGER * target), int(longest))
+        target = min(math.ceil(LARGER * target), most)
 
 
 def _cut(axes: Sequence[Axis], target: int, rule: Stopping | None) -> tuple[int, ...]:
@@ -278,8 +261,8 @@ def least_share(rule: Stopping | None) -> float:
 # --------------------------------------------------------------------------------------------------
 # The forecast of a run: blocks, bytes, memory and time, and why it has to be confirmed.
 
-#: Block timeout by which a forecast, which is answered within 5 s, abandons the batch of scenes.
-PLAN_S = 12.0
+#: Seconds after which a forecast, which is answered within 5 s, abandons the batch of scenes.
+PLAN_S = 1.5
 
 #: Seconds of a run apart from its blocks: processes start and end, packages are imported.
 START_S = 1.5
@@ -309,10 +292,10 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
     check_positive("workers", workers, "expected at least 1", whole=True)
     with Child() as child:
         timing = measure(child, pipeline, PLAN_S)
-    least = least_share(make_rule(pipeline)) * pipeline.size(Stage.scene) * timing.scene_s
+    least = least_share(make_rule(pipeline)) * pipeline.size(Stage.scene) * timing.pose_s
     here = default_workers()
     count = workers or (1 if least < SMALL_RUN_S else here)
-    blocks = blocks_of(pipeline, timing.scene_s, count)
+    blocks = blocks_of(pipeline, timing.pose_s, count)
     expected = forecast_of(
         f"runs/{pipeline.name}.zarr", pipeline, timing, blocks, min(count, here))
     expected.workers = count
@@ -339,7 +322,7 @@ def forecast_of(
     poses, left = pipeline.size(Stage.scene), len(blocks) if left is None else left
     left_poses = math.ceil(poses * left / max(len(blocks), 1))
     size = pipeline.experiment.bytes_of(left_poses)
-    seconds = START_S + left_poses * timing.scene_s / min(workers, max(len(blocks), 1))
+    seconds = START_S + left_poses * timing.pose_s / min(workers, max(len(blocks), 1))
     objections, free = [], free_bytes(url)
     if seconds > MAX_S:
         about = "about" if pipeline.stopping is None else "up to"
@@ -358,9 +341,7 @@ def forecast_of(
         files=left * (len(pipeline.experiment.variables) + 1),  # and a receipt
         bytes=size,
         worker_bytes=process + 3 * pipeline.experiment.bytes_of(math.prod(blocks.extents)),
-        pose_s=timing.scene_s,
-        sampled=timing.sampled,
-        over=timing.over,
+        **timing._asdict(),
         workers=workers,
         seconds=seconds,
         least_share=least_share(make_rule(pipeline)),

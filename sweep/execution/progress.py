@@ -61,15 +61,16 @@ ProgressReport = Callable[[Progress], None]
 StageReport = Callable[[str, float], None]
 
 
-@contextlib.contextmanager
-def progress_report(progress: bool | ProgressReport | None) -> Iterator[ProgressReport | None]:
-    """Yield the function that is called with a run's progress.
+def progress_report(
+    progress: bool | ProgressReport | None,
+) -> contextlib.AbstractContextManager[ProgressReport | None]:
+    """Return a context of the function that is called with a run's progress.
 
     Parameters
     ----------
     progress
         True for a display on stderr: a bar on a terminal, lines elsewhere; None or False for
-        nothing; a function is returned as it is.
+        nothing; a function is called as it is.
 
     Raises
     ------
@@ -77,12 +78,10 @@ def progress_report(progress: bool | ProgressReport | None) -> Iterator[Progress
         If it is none of these.
     """
     if progress is True:
-        with progress_display(ends=True) as display:
-            yield display
-    elif callable(progress) or not progress:
-        yield progress or None
-    else:
+        return progress_display(ends=True)
+    if progress and not callable(progress):
         raise ArgumentError("progress", progress, "expected True, False, None or a function")
+    return contextlib.nullcontext(progress or None)
 
 
 @contextlib.contextmanager

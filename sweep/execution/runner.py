@@ -23,7 +23,7 @@ from sweep.errors import (
     check_positive,
     path_of,
 )
-from sweep.execution import TIME_LIMIT_S, forecast, status
+from sweep.execution import forecast, status
 from sweep.execution.block_task import is_reusable, match
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport, progress_report
@@ -168,7 +168,7 @@ def execute(
             timing = forecast.timing_of(begun, done)
             left = 1 - len(done) / len(begun.blocks)
         else:
-            timing = forecast.measure(child, pipeline, time_limit_s or TIME_LIMIT_S)
+            timing = forecast.measure(child, pipeline)
             # In waves, nobody knows how much more than the first one is needed.
             left = forecast.least_share(rule)
         interrupts = stack.enter_context(Interrupts())
@@ -178,11 +178,11 @@ def execute(
 
             executor = stack.enter_context(connected(pipeline, scheduler, client, workers))
         else:
-            large = left * pipeline.size(Stage.scene) * timing.scene_s >= SMALL_RUN_S
+            large = left * pipeline.size(Stage.scene) * timing.pose_s >= SMALL_RUN_S
             executor = stack.enter_context(Children(
                 child, workers or default_workers(), at_once=large or workers is not None))
         cut = begun.blocks if begun is not None else forecast.blocks_of(
-            pipeline, timing.scene_s, executor.threads, time_limit_s)
+            pipeline, timing.pose_s, executor.threads, time_limit_s)
         expected = forecast.forecast_of(
             url, pipeline, timing, cut, executor.threads, len(cut) - len(done))
         if expected.objections and not (yes or sources):
@@ -195,7 +195,7 @@ def execute(
             begun = lifecycle.create_store(url, pipeline, cut.extents)
         if stricter or again:  # once nothing refuses the run
             begun = lifecycle.reopen(begun, pipeline if stricter else None, again)
-        limit_s = forecast.block_time_limit_s(time_limit_s, timing.scene_s * len(begun.blocks[0]))
+        limit_s = forecast.block_time_limit_s(time_limit_s, timing.pose_s * len(begun.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = compute(begun, executor, sources, limit_s, interrupts, progress)
     return status.summary_of(

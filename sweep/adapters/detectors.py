@@ -9,6 +9,7 @@ import importlib
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -69,9 +70,9 @@ Search = Callable[[Any], Iterable[tuple[int, Any, float]]]
 
 
 def apriltag(
-    package: str, meaning: str, search_with: Callable[[Any, str], Search], **fields: Any
+    package: str, meaning: str, search_with: Callable[[ModuleType, Any, str], Search], **fields: Any
 ) -> DetectorPlugin:
-    """Return a package's plug-in; ``search_with`` settings and a family returns its search.
+    """Return a package's plug-in; ``search_with`` it, settings and a family returns its search.
 
     AprilTag's corners run counter-clockwise from the bottom left of its own bitmap, which OpenCV's
     dictionaries have turned by 180°. Its coordinates have the image's top left corner at the
@@ -79,7 +80,7 @@ def apriltag(
     """
 
     def make(settings: AprilTagSettings, family: str) -> Callable[[Any], Markers]:
-        search = search_with(settings, family)
+        search = search_with(importlib.import_module(package.replace("-", "_")), settings, family)
 
         def markers(image: Any) -> Markers:
             found = [(number, quad) for number, quad, contrast in search(image)
@@ -96,25 +97,20 @@ def apriltag(
         "pixel_center": 0.5, **fields})
 
 
-def by_ctypes(module: str) -> Callable[[Any, str], Search]:
-    """Return the search with the class ``Detector`` of one of two modules, of one descent."""
-
-    def search_with(settings: AprilTagSettings, family: str) -> Search:
-        detector = importlib.import_module(module).Detector(
-            families=family, nthreads=1, quad_decimate=settings.quad_decimate,
-            quad_sigma=settings.quad_sigma, refine_edges=int(settings.refine_edges),
-            decode_sharpening=settings.decode_sharpening)
-        return lambda image: [(tag.tag_id, tag.corners, tag.decision_margin)
-                              for tag in detector.detect(image)
-                              if tag.hamming <= settings.max_hamming]
-
-    return search_with
+def by_ctypes(package: ModuleType, settings: AprilTagSettings, family: str) -> Search:
+    """Return the search with the class ``Detector`` of one of two packages, of one descent."""
+    detector = package.Detector(
+        families=family, nthreads=1, quad_decimate=settings.quad_decimate,
+        quad_sigma=settings.quad_sigma, refine_edges=int(settings.refine_edges),
+        decode_sharpening=settings.decode_sharpening)
+    return lambda image: [(tag.tag_id, tag.corners, tag.decision_margin)
+                          for tag in detector.detect(image)
+                          if tag.hamming <= settings.max_hamming]
 
 
 #: Before AprilTag's fix of edges, and with it.
-PUPIL_APRILTAGS = apriltag(
-    "pupil-apriltags", "AprilTag's C library 3.1", by_ctypes("pupil_apriltags"))
-PYAPRILTAGS = apriltag("pyapriltags", "AprilTag's C library 3.4", by_ctypes("pyapriltags"))
+PUPIL_APRILTAGS = apriltag("pupil-apriltags", "AprilTag's C library 3.1", by_ctypes)
+PYAPRILTAGS = apriltag("pyapriltags", "AprilTag's C library 3.4", by_ctypes)
 
 
 @dataclass(frozen=True)
@@ -135,11 +131,9 @@ class WPILibSettings(AprilTagSettings):
     deglitch: bool = parameter(False, "WPILib: clean up the threshold, for noisy images")
 
 
-def with_wpilib(settings: WPILibSettings, family: str) -> Search:
+def with_wpilib(package: ModuleType, settings: WPILibSettings, family: str) -> Search:
     """Return the search with WPILib's detector."""
-    import robotpy_apriltag  # noqa: PLC0415  (optional)
-
-    detector = robotpy_apriltag.AprilTagDetector()
+    detector = package.AprilTagDetector()
     config = detector.getConfig()
     config.numThreads = 1
     config.quadDecimate = settings.quad_decimate

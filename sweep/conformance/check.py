@@ -31,7 +31,6 @@ from sweep.typing import Floats, Integers
 # The scenes on which plug-ins are tried: free of noise, and each with its point reflection.
 
 SCENES = 32
-SIDES_PX, STEEP_DEG = (60.0, 150.0), (80.0, 85.0)
 RANGES = {
     "azimuth_deg": (0, 180), "roll_deg": (0, 180), "tilt_deg": (0, 45), "bearing_x_deg": (-8, 8),
     "bearing_y_deg": (-8, 8),
@@ -61,14 +60,14 @@ def trial_pipeline(
     """
     rng, half = np.random.default_rng(20), count // 2
     drawn = pd.DataFrame({name: rng.uniform(*ends, half) for name, ends in RANGES.items()})
-    drawn["side_px"] = np.geomspace(*SIDES_PX, half).round(2)
+    drawn["side_px"] = np.geomspace(60.0, 150.0, half).round(2)
     if not of_boards and dictionary in dictionary_names():  # an unknown one is refused below
         drawn["marker_id"] = rng.integers(marker_count(dictionary), size=half)
     drawn = drawn.assign(width_px=640, height_px=480, noise_grey=noise_grey)
     reflected = drawn.copy()
     reflected[["azimuth_deg", "roll_deg"]] += 180
     reflected[["bearing_x_deg", "bearing_y_deg"]] *= -1
-    steep = drawn.assign(tilt_deg=rng.uniform(*STEEP_DEG, half))
+    steep = drawn.assign(tilt_deg=rng.uniform(80.0, 85.0, half))
     scenes = pd.concat([drawn, reflected, steep, pd.DataFrame(ODD)]).fillna(0).round(6)
     document: dict[str, Any] = {
         "title": "Conformance", "camera": {"fx_px": 600.0, "fy_px": 600.0},
@@ -173,25 +172,24 @@ def judged_corners(
         The plug-in's conventions, by which its corners were changed; None for OpenCV, whose offset
         is noted.
     """
-    rows = [row for row, answer in enumerate(answers) if answer]
-    if not rows:
+    ids, found = np.full(len(marker_id), -1), np.full(corners_px.shape, np.nan)
+    for row, (numbers, quads) in ((row, each) for row, each in enumerate(answers) if each):
+        away = np.linalg.norm((quads - corners_px[row]).mean(axis=1), axis=1)
+        best = np.lexsort([away, numbers != marker_id[row]])[0]
+        ids[row], found[row] = numbers[best], quads[best]
+    rows = np.flatnonzero(ids >= 0)
+    if not len(rows):
         return Finding(FAULT, "no marker was found")
-    drawn, truth = marker_id[rows], corners_px[rows]
-    ids, found = np.empty_like(drawn), np.empty_like(truth)
-    for i, row in enumerate(rows):
-        away = np.linalg.norm((answers[row][1] - truth[i]).mean(axis=1), axis=1)
-        best = np.lexsort([away, answers[row][0] != drawn[i]])[0]
-        ids[i], found[i] = (part[best] for part in answers[row])
-    x, y = offset = (found - truth).mean(axis=(0, 1))  # in whichever order
-    order, distance = fitting_order(found - offset, truth)
-    error = found[:, order] - truth
-    rms_px = float(np.sqrt(((error - offset) ** 2).sum(axis=2).mean()))
+    x, y = offset = np.nanmean(found - corners_px, axis=(0, 1))  # in whichever order
+    order, distance = fitting_order(found[rows] - offset, corners_px[rows])
+    error = found[:, order] - corners_px
+    rms_px = float(np.sqrt(np.nanmean(((error - offset) ** 2).sum(axis=2))))
     numbers = {"offset_px": offset.tolist(), "rms_px": rms_px}
 
-    faults = []
-    if (wrong := ids != drawn).any():
-        faults.append(f"IDs are wrong in {wrong.sum()} of {len(rows)} scenes: "
-                      f"{ids[wrong][0]} for marker {drawn[wrong][0]}")
+    faults, wrong = [], rows[ids[rows] != marker_id[rows]]
+    if len(wrong):
+        faults.append(f"IDs are wrong in {len(wrong)} of {len(rows)} scenes: "
+                      f"{ids[wrong[0]]} for marker {marker_id[wrong[0]]}")
     if distance > FITS:
         faults.append("corners are in no fixed order of the marker, or are no pixels (x, y)")
     elif order != (0, 1, 2, 3):
@@ -202,9 +200,7 @@ def judged_corners(
         return Finding(FAULT, "; ".join(faults), numbers)
 
     # Errors that belong to the marker cancel in the mean of a scene and its reflection.
-    means = np.full((len(corners_px), 2), np.nan)
-    means[rows] = error.mean(axis=1)
-    pairs = means.reshape(2, -1, 2).mean(axis=0)
+    pairs = error.mean(axis=1).reshape(2, -1, 2).mean(axis=0)
     pairs = pairs[np.isfinite(pairs[:, 0])]
     spread = pairs.std(axis=0, ddof=1) / np.sqrt(len(pairs)) if len(pairs) > 1 else np.zeros(2)
     if (np.abs(offset) <= MAX_OFFSET_PX + STANDARD_ERRORS * spread).all():
@@ -222,9 +218,6 @@ def judged_corners(
 
 # --------------------------------------------------------------------------------------------------
 # The six checks, which run in a child process that the plug-in may end or never leave.
-
-#: Time limit of each check.
-TIME_LIMIT_S = 120.0
 
 #: Share of the scenes in which a marker must be found, or solved: all are large and sharp.
 FEWEST_SHARE = 0.75
@@ -245,16 +238,15 @@ def findings_of(kind: str, pipeline: Pipeline) -> Iterator[Finding]:
     first = answers(every)
     yield Finding(OK, "right shapes and types")
 
-    found, of_detector = sum(map(bool, first)), kind == "detector"
+    found, word, hint = sum(map(bool, first)), "detected", ""
+    if kind == "estimator":
+        word, hint = "solved", "; expected poses of marker to camera, OpenCV's axes, metres"
     verdict = OK if found == SCENES else NOTE if found >= FEWEST_SHARE * SCENES else FAULT
-    word = "detected" if of_detector else "solved"
-    hint = "; expected poses of marker to camera, OpenCV's axes, metres"
-    line = f"{word} in {found} of {SCENES} scenes"
-    yield Finding(
-        verdict, line + hint * (verdict == FAULT and not of_detector), {word: found})
+    line = f"{word} in {found} of {SCENES} scenes{hint * (verdict == FAULT)}"
+    yield Finding(verdict, line, {word: found})
 
     scenes = scenes_at(pipeline.experiment, [np.array(every)]).scenes
-    if of_detector:
+    if kind == "detector":
         (setting,) = pipeline.experiment.detectors
         record = setting.record() if isinstance(setting, PluginSetting) else None
         yield judged_corners(first, scenes.marker_id, scenes.corners_px, record)
@@ -267,19 +259,18 @@ def findings_of(kind: str, pipeline: Pipeline) -> Iterator[Finding]:
                      for number, answer in zip(order, answers(order), strict=True)
                      if _bits(answer) != _bits(first[number])}
         if different:
-            return Finding(FAULT, f"called {how}, it gives other results in {len(different)} of "
-                           f"{SCENES} scenes")
+            return Finding(FAULT, f"{len(different)} of {SCENES} scenes differ, called {how}")
         return Finding(OK, f"the same bits, called {how}")
 
     yield same([every], "again")
 
     told = dict[str, None]()
-    for number in range(SCENES, len(pipeline.axes[0])):
+    columns = pipeline.axes[0].columns
+    sizes = zip(columns["width_px"], columns["height_px"], strict=True)
+    for number, (width, height) in [*enumerate(sizes)][SCENES:]:
         try:
             answers([number])
         except PluginError as error:
-            width, height = (pipeline.axes[0].columns[side][number]
-                             for side in ("width_px", "height_px"))
             told[f"a frame of {width} x {height} px: {error}"] = None
     yield same([every[::-1], *([row] for row in every)], "in reverse order, alone, after odd input")
 
@@ -304,7 +295,7 @@ def _next(number: int, kind: str, pipeline: Pipeline) -> Finding:
 
 def check_plugin(
     name: str, dictionary: str | None = None, settings: Sequence[str] = (), *,
-    folder: str = ".", time_limit_s: float = TIME_LIMIT_S,
+    folder: str = ".", time_limit_s: float = 120.0,
 ) -> pd.DataFrame:
     """Try a detector or a solver on 32 noise-free scenes, and on some that it may not expect.
 
@@ -355,10 +346,8 @@ def check_plugin(
                 findings[check] = child.call(
                     _next, number, plugin.kind, pipeline, limit_s=time_limit_s)
             except (ChildError, PluginError) as error:
-                line = str(error).strip().splitlines()[-1]
-                if isinstance(error, ChildDiedError):
-                    line = f"the call ended by {line}"
-                findings[check] = Finding(FAULT, line)
+                ended = "the call ended by " if isinstance(error, ChildDiedError) else ""
+                findings[check] = Finding(FAULT, ended + getattr(error, "line", str(error)))
                 break
     report = pd.DataFrame(
         [(check, *found[:2]) for check, found in findings.items()],

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 from sweep.declaration import parameter
 
@@ -78,17 +78,16 @@ class Plugin:
         How to install it (default: ``pip install`` and the distribution).
     """
 
-    #: The field that a class or function may stand for, without a record.
-    function: ClassVar[str] = "make"
     settings: type[Any] | None = None
     meaning: str = ""
     distribution: str | Sequence[str] = ()
     install: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be called."""
-        if not callable(getattr(self, self.function)):
-            raise TypeError(f"{self.function}: expected a class or function")
+        """Refuse values that no plug-in has."""
+        for name, (fits, expected) in EXPECTED.items():
+            if hasattr(self, name) and not fits(getattr(self, name)):
+                raise ValueError(f"{name} = {getattr(self, name)!r}: expected {expected}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,16 +119,6 @@ class DetectorPlugin(Plugin):
     corner_order: tuple[int, int, int, int] = (0, 1, 2, 3)
     families: Mapping[str, str] | None = field(default=None, hash=False)
     margin_px: int | Callable[[Any], int] | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse conventions that cannot be."""
-        super().__post_init__()
-        if sorted(self.corner_order) != [0, 1, 2, 3]:
-            raise ValueError(
-                f"corner_order = {self.corner_order!r}: expected the numbers 0 to 3, each once"
-            )
-        if not -1 <= self.pixel_center <= 1:
-            raise ValueError(f"pixel_center = {self.pixel_center!r}: expected 0 or 0.5")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,19 +168,10 @@ class EffectPlugin(Plugin):
         Whether more than the usual window must be searched: "noise" or "uneven light".
     """
 
-    function: ClassVar[str] = "apply"
     apply: Callable[[Any, Any], Any]
     step: Literal["light", "signal"] = "light"
     random: bool = False
     widens: Widens = "nothing"
-
-    def __post_init__(self) -> None:
-        """Refuse what no effect has."""
-        super().__post_init__()
-        if self.step not in ("light", "signal"):
-            raise ValueError(f"step = {self.step!r}: expected light or signal")
-        if self.widens not in get_args(Widens):
-            raise ValueError(f"widens = {self.widens!r}: expected nothing, noise or uneven light")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,9 +186,19 @@ class RendererPlugin(Plugin):
         that the marker does not cover counts as 0, and the marker's share of each pixel.
     """
 
-    function: ClassVar[str] = "render"
     render: Callable[[Any], Any]
 
+
+#: Field of a record -> whether a value of it can be, and the expectation in words.
+EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
+    **dict.fromkeys(("make", "apply", "render"), (callable, "a class or function")),
+    "distribution": (lambda names: isinstance(names, str | Sequence), "a name, or several"),
+    "families": (lambda names: isinstance(names, Mapping | None), "names by dictionary, or None"),
+    "pixel_center": (lambda center: -1 <= center <= 1, "0 or 0.5"),
+    "corner_order": (lambda order: sorted(order) == [0, 1, 2, 3], "the numbers 0 to 3, each once"),
+    "step": (lambda step: step in ("light", "signal"), "light or signal"),
+    "widens": (lambda widens: widens in get_args(Widens), "nothing, noise or uneven light"),
+}
 
 #: Kind of plug-in -> its record.
 RECORDS: dict[str, type[Plugin]] = {

@@ -47,7 +47,7 @@ def printing_to_stderr() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _its_faults(begin: str, path: str = "") -> Iterator[None]:
+def _its_faults(begin: str = "a plug-in that can be imported:", path: str = "") -> Iterator[None]:
     """Raise PluginError for whatever is raised, also for an attempt to exit: one line.
 
     The line begins with a text and ends, for a plug-in in a file, with its line of the file. If
@@ -102,10 +102,8 @@ def real_numbers(
         If it is none; also for what NumPy would make numbers of by leaving something away, or by
         guessing: complex numbers, texts, masked values.
     """
-    try:
+    with _its_faults(f"{name}: returned {what} that are no array of numbers:"):
         array = np.asarray(returned)
-    except Exception:
-        raise PluginError(f"{name}: returned {what} that are no array of numbers") from None
     if shape[0] < 0 and not array.size:
         array = array.reshape(0, *shape[1:])
     kinds, words = ("iu", "whole") if whole else ("biuf", "real")
@@ -146,9 +144,8 @@ class ArrayFile:
 
     def content(self) -> bytes:
         """Return the content of the file: the same bytes for the same attributes."""
-        file, names = io.BytesIO(), [each.name for each in dataclasses.fields(self)]
-        np.savez_compressed(  # its members have a fixed date
-            file, version=self.version, **{name: getattr(self, name) for name in names})
+        file = io.BytesIO()  # its members have a fixed date
+        np.savez_compressed(file, version=self.version, **dataclasses.asdict(self))
         return file.getvalue()
 
     @classmethod
@@ -374,12 +371,12 @@ def load(kind: str, name: str, folder: str) -> tuple[Plugin, str, Versions]:
         found = names[attribute]
     else:
         entry = _entry_point(kind, name)
-        with _its_faults(IMPORTED), printing_to_stderr():
+        with _its_faults(), printing_to_stderr():
             found = entry.load()
         if entry.dist is not None and entry.dist.name != OWN_DISTRIBUTION:
             versions[entry.dist.name] = entry.dist.version
     if callable(found) and not isinstance(found, Plugin) and kind != "effect":
-        found = record(**{record.function: found})
+        found = record(**{"render" if kind == "renderer" else "make": found})
     if not isinstance(found, record):
         raise PluginError(f"a record {record.__name__}, not a value of type {type(found).__name__}")
     needed = found.distribution
@@ -393,9 +390,6 @@ def load(kind: str, name: str, folder: str) -> tuple[Plugin, str, Versions]:
     return found, digest, tuple(sorted(versions.items()))
 
 
-IMPORTED = "a plug-in that can be imported:"
-
-
 @lru_cache(maxsize=256)
 def _module(path: str, digest: str, source: bytes) -> ModuleType:
     """Execute a file once in each process."""
@@ -404,7 +398,7 @@ def _module(path: str, digest: str, source: bytes) -> ModuleType:
     module.__file__ = path
     sys.modules[name] = module  # dataclasses find their annotations there
     known = set(sys.modules)
-    with _its_faults(IMPORTED, path), printing_to_stderr():
+    with _its_faults(path=path), printing_to_stderr():
         exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102  (the user's own file)
     folder = Path(path).parent.resolve()
     for other in set(sys.modules) - known:
@@ -572,16 +566,14 @@ def described(name: str, folder: str = ".") -> list[DeclaredPlugin]:
         If there is none, or one cannot be used.
     """
     kinds = [kind for kind in RECORDS if file_of(name) or name in offered(kind).names]
-    if not kinds:
-        hint = nearest(name, [each["name"] for each in installed()])
-        raise ArgumentError(
-            "name", name, f"no such plug-in{hint or '; `sweep plugins` lists them'}")
     found, faults = [], []
     for kind in kinds:
         try:
             found.append(declare(kind, name, folder))
         except PluginError as error:
-            faults.append(str(error))
+            faults.append(f"expected {error}")
     if not found or (faults and not file_of(name)):
-        raise ArgumentError("name", name, f"expected {faults[0]}")
+        hint = nearest(name, [each["name"] for each in installed()])
+        faults.append(f"no such plug-in{hint or '; `sweep plugins` lists them'}")
+        raise ArgumentError("name", name, faults[0])
     return found

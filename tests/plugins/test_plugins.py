@@ -339,7 +339,7 @@ def test_what_a_function_margin_px_raises_is_the_plug_in_s_fault(bad):
     ("D = 3", "a record DetectorPlugin, not a value of type int"), ("", "a name in mine.py"),
     ("import beside_it\nD = print", "imports beside_it.py beside it; put both"),
     ("from sweep.plugins import DetectorPlugin\nD = DetectorPlugin(make=1)",
-     "TypeError: make: expected a class or function (line 2 of mine.py)"),
+     "ValueError: make = 1: expected a class or function (line 2 of mine.py)"),
     ("from sweep.plugins import *\nD = DetectorPlugin(make=print, distribution=(3,))",
      "the distribution 3, which is not installed"),
     ("from sweep.plugins import *\nD = DetectorPlugin(make=print, distribution='not-there-9')",

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,27 +37,19 @@ from sweep.store.provenance import changes, differences, fingerprint
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
-# Where the cells of a new grid lie in an old one: cells agree where all parameter values do.
+# Finished cells of other stores, copied into a new one: grids grow, halves are joined.
 #
-# Whether a parameter is fixed, an axis of its own, or goes together with others does not matter:
-# a cell of the new grid gives every parameter a value, and these are looked up in the old grid. A
-# parameter that one of the two grids keeps fixed is an axis of one value there.
+# A cell is reusable if the fingerprint and all its parameter values agree, and nothing of it
+# failed or crashed. Whether a parameter is fixed, an axis of its own, or goes together with others
+# does not matter: a cell of the new grid gives every parameter a value, and these are looked up in
+# the old grid, where a parameter that it keeps fixed is an axis of one value. Which cells an old
+# store has finished follows from its receipts and flags; the old store is only read.
 
-class Key(NamedTuple):
-    """An axis of an old grid, what finds a row along it, and the new axes that give the row."""
+class Source(NamedTuple):
+    """An old store, and the numbers of its committed blocks."""
 
-    axis: Axis
-    row_of: Callable[[tuple[Any, ...]], int | None]
-    new: list[Axis]
-
-    def rows(self, along: Sequence[range]) -> Iterator[int]:
-        """Yield the row, -1 without, at each combination of indices along the new axes."""
-        for indices in itertools.product(*along):
-            values: dict[str, Any] = {}
-            for axis, index in zip(self.new, indices, strict=True):
-                values |= axis.at(index)
-            row = self.row_of(tuple(values[name] for name in self.axis.columns))
-            yield -1 if row is None else row
+    store: RunStore
+    done: AbstractSet[int]
 
 
 def _axes(pipeline: Pipeline, names: AbstractSet[str]) -> list[Axis]:
@@ -70,61 +60,49 @@ def _axes(pipeline: Pipeline, names: AbstractSet[str]) -> list[Axis]:
             *(Axis(name, {name: (fixed.get(name),)}) for name in sorted(names - own))]
 
 
-def _row_finder(axis: Axis) -> Callable[[tuple[Any, ...]], int | None]:
-    first, *others = axis.columns.values()
-    if isinstance(first, range) and not others:  # of trials, which may be many
-        return lambda row: first.index(row[0]) if row[0] in first else None
-    return {row: k for k, row in enumerate(zip(first, *others, strict=True))}.get
+def _both_axes(new: Pipeline, old: Pipeline) -> tuple[list[Axis], list[Axis]]:
+    """Return the axes of two grids, each with those that only the other has."""
+    names = {name for grid in (new, old) for axis in grid.axes for name in axis.columns}
+    return _axes(new, names), _axes(old, names)
 
 
-@dataclass(frozen=True, slots=True)
-class Source:
-    """An old store, and how the cells of a new grid are found in it.
+def _rows(pipeline: Pipeline, block: Block, old: Pipeline) -> dict[str, NDArray[np.intp]]:
+    """Return axis of an old grid -> row along it of each cell of a block, -1 without.
 
-    Attributes
-    ----------
-    store
-        The old store.
-    done
-        Numbers of its committed blocks.
-    keys
-        The axes of its grid, and those that only the new one has.
+    They are of shape (scenes, detector settings, estimators).
     """
-
-    store: RunStore
-    done: AbstractSet[int]
-    keys: list[Key]
-
-    @staticmethod
-    def of(new: Pipeline, store: RunStore, done: AbstractSet[int]) -> Source:
-        """Return how the cells of a new grid are found in a store."""
-        old = store.pipeline
-        names = {name for each in (new, old) for axis in each.axes for name in axis.columns}
-        return Source(store, done, [
-            Key(axis, _row_finder(axis), [
-                each for each in _axes(new, names)
-                if not axis.columns.keys().isdisjoint(each.columns)])
-            for axis in _axes(old, names)])
-
-    def read(
-        self, name: str, number: int, at: Mapping[str, NDArray[np.intp]]
-    ) -> NDArray[Any]:
-        """Return a variable of some cells of an old block (cells, inner), by their indices."""
-        pipeline, block = self.store.pipeline, self.store.blocks[number]
-        old = next(each for each in self.store.variables if each.name == name)
-        starts = dict(zip(
-            (axis.name for axis in pipeline.experiment.scene_axes), block.starts, strict=True))
-        part = np.asarray(self.store.array(name)[blocks.region(old, pipeline, block)])
-        return part[tuple(
-            at[name] - starts.get(name, 0) for name in old.dimensions(pipeline) if name in at)]
+    new_axes, old_axes = _both_axes(pipeline, old)
+    scenes = pipeline.axes_of(Stage.scene)
+    starts = dict(zip((axis.name for axis in scenes), block.starts, strict=True))
+    lengths = dict(zip(starts, block.shape, strict=True))
+    shape = [lengths.get(axis.name, len(axis)) for axis in new_axes]
+    values: dict[str, list[Any]] = {}
+    for axis, indices in zip(new_axes, np.indices(shape), strict=True):
+        along = (indices.ravel() + starts.get(axis.name, 0)).tolist()
+        values |= {name: [column[k] for k in along] for name, column in axis.columns.items()}
+    found = {}
+    for axis in old_axes:
+        cells = [*zip(*(values[name] for name in axis.columns), strict=True)]
+        rows = {cell: axis.index_of(dict(zip(axis.columns, cell, strict=True)))
+                for cell in set(cells)}
+        found[axis.name] = np.array(
+            [-1 if (row := rows[cell]) is None else row for cell in cells], dtype=np.intp,
+        ).reshape(len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
+    return found
 
 
-# --------------------------------------------------------------------------------------------------
-# Finished cells of other stores, copied into a new one: grids grow, halves are joined.
-#
-# A cell is reusable if the fingerprint and all its parameter values agree, and nothing of it
-# failed or crashed. Which cells an old store has finished follows from its receipts and flags;
-# the old store is only read.
+def _read(
+    store: RunStore, name: str, number: int, at: Mapping[str, NDArray[np.intp]]
+) -> NDArray[Any]:
+    """Return a variable of some cells of an old block (cells, inner), by their indices."""
+    pipeline, block = store.pipeline, store.blocks[number]
+    variable = next(each for each in store.variables if each.name == name)
+    starts = dict(zip(
+        (axis.name for axis in pipeline.experiment.scene_axes), block.starts, strict=True))
+    part = np.asarray(store.array(name)[blocks.region(variable, pipeline, block)])
+    return part[tuple(
+        at[name] - starts.get(name, 0) for name in variable.dimensions(pipeline) if name in at)]
+
 
 #: Flags of cells that are not reused, so that the new store has the reasons of all its failures.
 LOST = {
@@ -145,23 +123,22 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     """
     old = store.pipeline
     mine, theirs = fingerprint(pipeline), store.fingerprint
-    # A file that only one of them refers to is a value that only one of them has.
-    for part in ("files", "plugins"):  # as of a plug-in
+    # A file or plug-in that only one of them refers to is a value that only one of them has.
+    for part in ("files", "plugins"):
         shared = mine.get(part, {}).keys() & theirs.get(part, {}).keys()
         for stamp in (mine, theirs):
             stamp[part] = {name: stamp[part][name] for name in sorted(shared)}
     present = {variable.name for variable in store.variables}
     lacking = [variable.name for variable in pipeline.experiment.variables
                if variable.name not in present and not variable.drawn_as]
-    source = Source.of(pipeline, store, blocks.check_whole(store))
+    source = Source(store, blocks.check_whole(store))
+    here, there = ({name: values for axis in axes for name, values in axis.columns.items()}
+                   for axes in _both_axes(pipeline, old))
     agree = (
         not any(changes(theirs, mine)) and pipeline.distributions == old.distributions
         and all(pipeline.fixed[name] == old.fixed[name]
                 for name in pipeline.fixed.keys() & old.fixed.keys())
-        # What several new axes give is looked up cell by cell.
-        and all(sum(len(axis) > 1 for axis in key.new) > 1
-                or any(row >= 0 for row in key.rows([range(len(axis)) for axis in key.new]))
-                for key in source.keys)
+        and all(not set(values).isdisjoint(there[name]) for name, values in here.items())
     )
     if lacking or not agree:
         lines = [f"{name}: not a variable of the store" for name in lacking]
@@ -198,54 +175,45 @@ def read_cells(
     processors that computed the blocks which cells come from.
     """
     experiment, processors = pipeline.experiment, set[str]()
-    parts = {axis.name: range(*cut) for axis, *cut in zip(
-        experiment.scene_axes, block.starts, block.stops, strict=True)}
-    for stage in (Stage.detection, Stage.estimation):
-        parts |= {axis.name: range(len(axis)) for axis in pipeline.axes_of(stage)}
     shape = len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation)
     available = np.zeros(shape, dtype=bool)
-    for source in sources:
-        at: dict[str, NDArray[np.intp]] = {}
-        for key in source.keys:
-            along = {axis.name: parts.get(axis.name, range(1)) for axis in key.new}
-            rows = np.array([*key.rows([*along.values()])]).reshape(
-                [len(part) if name in along else 1 for name, part in parts.items()])
-            at[key.axis.name] = np.broadcast_to(rows, [*map(len, parts.values())]).reshape(shape)
+    drawn = experiment.scene_values(block.indices()) if sources else {}
+    for store, done in sources:
+        at = _rows(pipeline, block, store.pipeline)
         wanted = ~available & np.all([rows >= 0 for rows in at.values()], axis=0)
-        old, numbers = source.store.blocks, np.zeros(shape, dtype=np.intp)
+        old, numbers = store.blocks, np.zeros(shape, dtype=np.intp)
         for axis, extent, count in zip(
-            source.store.pipeline.experiment.scene_axes, old.extents, old.counts, strict=True
+            store.pipeline.experiment.scene_axes, old.extents, old.counts, strict=True
         ):
             numbers = numbers * count + at[axis.name] // extent
-        present = {variable.name for variable in source.store.variables}
-        taken = np.zeros_like(available)
-        for number in source.done & {*np.unique(numbers[wanted]).tolist()}:
+        present = {variable.name for variable in store.variables}
+        taken = set[int]()
+        for number in done & {*np.unique(numbers[wanted]).tolist()}:
             inside = wanted & (numbers == number)
             # A cell is finished if its flags say that it was run. With a configuration of a scene
             # (or of a detection), what it shares is copied.
             where = {name: index[inside] for name, index in at.items()}
             ended = ~np.any([
-                np.isin(source.read(name, number, where), lost) for name, lost in LOST.items()],
+                np.isin(_read(store, name, number, where), lost) for name, lost in LOST.items()],
                 axis=0)
             inside[inside] = ended
-            taken |= inside
             scene, setting, estimator = np.nonzero(inside)
+            if not len(scene):
+                continue
             column = {Stage.scene: 0 * scene, Stage.detection: setting,
                       Stage.estimation: setting * shape[2] + estimator}
             where = {name: index[ended] for name, index in where.items()}
-            for v in experiment.variables if len(scene) else ():
+            for v in experiment.variables:
                 if v.name in present:
                     cells.columns[v.name][column[v.stage], scene] = v.fitted(
-                        source.read(v.name, number, where))
-        scenes = np.flatnonzero(taken.any(axis=(1, 2)))
-        if len(scenes):  # what follows from the parameters alone
-            drawn = experiment.scene_values(block.indices(scenes))
-            for v in experiment.variables:
-                if v.name not in present:
-                    cells.columns[v.name][0, scenes] = drawn[v.drawn_as].broadcast(len(scenes))
-        for _, receipt in blocks.receipts(source.store, np.unique(numbers[taken]).tolist()):
+                        _read(store, v.name, number, where))
+                else:  # it follows from the parameters alone
+                    values = drawn[v.drawn_as].broadcast(len(block))
+                    cells.columns[v.name][0, scene] = values[scene]
+            available |= inside
+            taken.add(number)
+        for _, receipt in blocks.receipts(store, taken):
             processors.update(receipt.processors)
-        available |= taken
     return available, processors
 
 
@@ -357,21 +325,18 @@ def compute_block(
                 _decider(url, run_id, decision.rule).needed(block, decision))
             sources = [_source(url, run_id, old) for old in reuse]
             if before is not None:
-                itself = {store.blocks.number(block)}
-                sources.insert(0, Source.of(store.pipeline, store, itself))
+                sources.insert(0, Source(store, {store.blocks.number(block)}))
             begun_before = blocks.begin_block(store, block)
             try:
                 start = time.perf_counter()
                 values, receipt = _computed(
                     store, block, needed, sources, time_limit_s, isolated=begun_before)
-                seconds = receipt.seconds if before is None else {
-                    stage: [sum(both) for both in itertools.zip_longest(
-                        before.seconds[stage], spent, fillvalue=0.0)]
-                    for stage, spent in receipt.seconds.items()
-                }
-                return blocks.write_block(store, block, values, dataclasses.replace(
-                    receipt, seconds=seconds, wall_s=time.perf_counter() - start,
-                    written=time.time(), basis=basis))
+                if before is not None:
+                    receipt = dataclasses.replace(receipt, seconds={
+                        stage: np.add(before.seconds[stage], spent).tolist()
+                        for stage, spent in receipt.seconds.items()})
+                receipt = blocks.write_block(store, block, values, dataclasses.replace(
+                    receipt, wall_s=time.perf_counter() - start, written=time.time(), basis=basis))
             except Exception:
                 if not begun_before:  # it did not end this process
                     blocks.withdraw_block(store, block)
@@ -380,6 +345,7 @@ def compute_block(
         raise
     except StoreError as error:  # one that this machine cannot use
         raise local_fault(str(error).removeprefix(f"{url}: ")) from None
+    return dataclasses.replace(receipt, failures=())
 
 
 def _computed(
@@ -397,7 +363,6 @@ def _computed(
     need = needed[:, None, None] & ~available
     # Scenes of which every cell is reused are not rendered.
     rows = np.flatnonzero(need.any(axis=(1, 2)))
-    seconds: dict[str, list[float]] = {stage: [] for stage in cells.seconds}
     if len(rows):
         some = _compute(pipeline, block.indices(rows), need[rows], time_limit_s, isolated=isolated)
         # A cell is computed or reused as a whole.
@@ -407,7 +372,7 @@ def _computed(
         for v in experiment.variables:
             column, row = np.nonzero(computed[v.stage])
             cells.columns[v.name][column, rows[row]] = some.columns[v.name][column, row]
-        seconds, cells.failures = some.seconds, some.failures
+        cells.seconds, cells.failures = some.seconds, some.failures
         processors.add(processor())
     for v in experiment.variables:
         cells.columns[v.name][:, ~needed] = v.not_needed
@@ -421,7 +386,7 @@ def _computed(
                   "estimates": int(need.sum())},
         detection=flag_counts(DetectionStatus, values["detection"]),
         estimate=flag_counts(EstimateStatus, values["estimate"]),
-        seconds=seconds,
+        seconds=cells.seconds,
         failures=blocks.recorded(pipeline, block, cells.failures, rows.tolist()),
     )
 

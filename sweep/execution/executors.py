@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Generator, Iterable
+from collections.abc import Callable, Collection, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple, Self
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple, Self
 from sweep.errors import StoreReplacedError
 from sweep.evaluation.machine_faults import machine_fault
 from sweep.execution.block_task import compute_block
-from sweep.isolation.child_process import POLL_S, Child, ChildDiedError, Interrupts
+from sweep.isolation.child_process import POLL_S, Child, ChildDiedError, ChildError, Interrupts
 from sweep.messages import exception_line, notice
 from sweep.store.blocks import Receipt
 
@@ -52,29 +51,23 @@ class Failed(NamedTuple):
     worker: str = ""
 
 
-def failure(error: Exception, worker: str = "") -> Failed:
-    """Return why a block failed that raised.
+def attempt(
+    compute: Callable[..., Receipt | Failed], *arguments: Any, worker: str = ""
+) -> Receipt | Failed:
+    """Return the receipt of a block, which a function computes, or why there is none.
 
     Raises
     ------
     StoreReplacedError
         If the store was moved, deleted or replaced: this one goes on.
     """
-    if isinstance(error, StoreReplacedError):
-        raise error
-    fault = machine_fault(error)
-    return Failed(str(fault or exception_line(error)), fault is not None, worker=worker)
-
-
-def attempt(arguments: tuple[Any, ...], worker: str = "") -> Receipt | Failed:
-    """Return the receipt of a block, which a worker computes, or why there is none.
-
-    The receipt is without the cells that failed, which the store has.
-    """
     try:
-        return dataclasses.replace(compute_block(*arguments), failures=())
+        return compute(*arguments)
+    except StoreReplacedError:
+        raise
     except Exception as error:
-        return failure(error, worker)
+        fault = machine_fault(error)
+        return Failed(str(fault or exception_line(error)), fault is not None, worker=worker)
 
 
 #: A block's number, and the arguments of :func:`compute_block`.
@@ -158,7 +151,7 @@ class Executor(ABC):
 
     @abstractmethod
     def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
-        """Call :func:`attempt`, rather not where the block failed; return a future."""
+        """Have a block computed, rather not where it failed; return a future."""
 
     def result(self, future: Any) -> Receipt | Failed:
         """Return the receipt of a future that is done, or why there is none."""
@@ -244,25 +237,18 @@ class Children(Executor):
     def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
         """Have a thread call a child that is idle."""
         del failures
-        return self._pool.submit(self._call, arguments)
+        return self._pool.submit(attempt, self._call, *arguments)
 
-    def _call(self, arguments: tuple[Any, ...]) -> Receipt | Failed:
+    def _call(self, *arguments: Any) -> Receipt | Failed:
         *_, limit_s, _ = arguments
         child = self._idle.get()
         try:
-            try:
-                # The block keeps its own time limit; this one is for what surrounds it.
-                result = child.call(attempt, arguments, limit_s=2 * limit_s)
-            except ChildDiedError as error:
-                result = Failed(
-                    f"its process ended: {error.line}", error.from_outside, died=True)
-            if isinstance(result, Failed):
-                child.restart()
-        except Exception as error:  # of a process that cannot be started
-            return failure(error)
+            # The block keeps its own time limit; this one is for what surrounds it.
+            return child.call(compute_block, *arguments, limit_s=2 * limit_s)
+        except ChildError as error:
+            return Failed(error.line, error.from_outside, isinstance(error, ChildDiedError))
         finally:
             self._idle.put(child)
-        return result
 
     def cancel(self, out: Collection[Any]) -> None:
         """End the processes if they still compute."""

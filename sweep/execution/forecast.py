@@ -127,7 +127,6 @@ def measure(child: Child, pipeline: Pipeline, limit_s: float = TIMING_LIMIT_S) -
     except (ChildRaisedError, MachineFaultError):
         return Timing(UNMEASURED_S, 0)
     except ChildDiedError as error:
-        child.restart()
         return Timing(limit_s, 1, over=True) if error.timed_out else Timing(UNMEASURED_S, 0)
 
 

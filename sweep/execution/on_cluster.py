@@ -10,16 +10,15 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import Any, Protocol, cast, runtime_checkable
 from urllib.parse import urlsplit
 
-import dask
 from distributed import Client, KilledWorker, LocalCluster, Security, get_worker, wait
 from distributed.core import rpc
 
 from sweep.errors import ArgumentError, RunError, StoreReplacedError
-from sweep.execution.block_task import other_here
+from sweep.execution.block_task import compute_block, other_here
 from sweep.execution.executors import Executor, Failed, attempt
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import ADVICE, SINGLE_THREADED, default_workers
@@ -80,7 +79,11 @@ def connected(
     own: Any = client
     with contextlib.ExitStack() as stack:
         if scheduler is not None:
-            stack.enter_context(silenced_dask_loggers())
+            for name in [*logging.Logger.manager.loggerDict]:  # this package's errors say it
+                if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):
+                    logger = logging.getLogger(name)
+                    stack.callback(logger.setLevel, logger.level)
+                    logger.setLevel(logging.CRITICAL)
             own = stack.enter_context(_local_cluster(workers or default_workers())) \
                 if scheduler == LOCAL else _checked_address(scheduler)
         elif not isinstance(client, (Client, Cluster)):
@@ -89,11 +92,10 @@ def connected(
                 "expected a distributed.Client or a cluster object such as LocalCluster; "
                 "the address of a scheduler is given as scheduler")
         try:
-            state = getattr(own, "status", "running")
-            state = "asynchronous" if getattr(own, "asynchronous", False) else (
-                getattr(state, "name", state))
-            if state in ("asynchronous", "closing", "closed", "failed"):
-                raise ValueError(f"it is {state}")
+            status = getattr(own, "status", "running")
+            state = "asynchronous" if getattr(own, "asynchronous", False) else str(status)
+            if state.endswith(("asynchronous", "closing", "closed", "failed")):
+                raise ValueError(f"it is {state.removeprefix('Status.')}")
             if not isinstance(own, Client):
                 own = stack.enter_context(Client(own, timeout=ANSWER_S, set_as_default=False))
             check_workers(own, pipeline)
@@ -110,14 +112,10 @@ def _local_cluster(workers: int) -> LocalCluster:
     Dask's limit of memory is off: results lie in the store, and a worker that it pauses waits for
     ever.
     """
-    environment = dask.config.get("distributed.nanny.pre-spawn-environ") | SINGLE_THREADED
-    routes = [*dask.config.get("distributed.scheduler.http.routes")]  # without Bokeh, Dask adds one
     try:
-        with dask.config.set({"distributed.nanny.pre-spawn-environ": environment,
-                              "distributed.scheduler.http.routes": routes}):
-            return LocalCluster(
-                n_workers=workers, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
-                dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL)
+        return LocalCluster(
+            n_workers=workers, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
+            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL, env=SINGLE_THREADED)
     except (RuntimeError, OSError) as error:
         raise RunError(f"{workers} workers cannot be started: {exception_line(error)}") from None
 
@@ -127,28 +125,26 @@ def _checked_address(address: str) -> str:
 
     If it begins with ``tls://``, Dask's own configuration names the certificates.
     """
+    async def ask() -> None:
+        options = Security().get_connection_args("client")
+        async with asyncio.timeout(ANSWER_S), rpc(
+            address, timeout=2 * ANSWER_S, connection_args=options
+        ) as server:
+            kind = (await server.identity())["type"]
+        if kind != "Scheduler":  # Dask's client waits without end for a worker
+            raise TypeError(f"a {kind}")
+
     try:
         # Dask's client waits without end for a handshake, so that comes first, and alone; in a
         # thread, since the caller may be in an event loop, as notebooks are.
         with ThreadPoolExecutor(1) as thread:
-            thread.submit(asyncio.run, _ask_scheduler(address)).result()
+            thread.submit(asyncio.run, ask()).result()
     except Exception as error:
         raise ArgumentError(
             "scheduler", address,
             f"expected an address such as tcp://host:8786, or {LOCAL}; no scheduler answers "
             f"there within {ANSWER_S:.0f} s: {exception_line(error)}") from None
     return address
-
-
-async def _ask_scheduler(address: str) -> None:
-    """Raise an error if what is at an address does not answer, or is a worker or a nanny."""
-    options = Security().get_connection_args("client")
-    async with asyncio.timeout(ANSWER_S), rpc(
-        address, timeout=2 * ANSWER_S, connection_args=options
-    ) as server:
-        kind = (await server.identity())["type"]
-    if kind != "Scheduler":
-        raise TypeError(f"a {kind}")
 
 
 def this_process(
@@ -194,21 +190,6 @@ def check_workers(client: Client, pipeline: Pipeline) -> None:
             "workers with other versions; install the same everywhere" + "".join(lines))
     for line in differing_processors(Counter(used for _, _, used in told.values()), "workers"):
         notice(f"warning: {line}")
-
-
-@contextlib.contextmanager
-def silenced_dask_loggers() -> Iterator[None]:
-    """Silence the loggers of Dask while the body runs: this package's errors say what matters."""
-    before = {logging.getLogger(name): logging.getLogger(name).level
-              for name in list(logging.Logger.manager.loggerDict)
-              if name.partition(".")[0] in ("distributed", "tornado", "asyncio")}
-    for logger in before:
-        logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        for logger, level in before.items():
-            logger.setLevel(level)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -289,7 +270,7 @@ class OnCluster(Executor):
         """Give blocks to the cluster: if some workers failed them, to others, best elsewhere."""
         others = self._others(failures) if failures else []
         return self._client.submit(
-            on_worker, arguments, pure=False, key=f"block-{time.monotonic_ns()}",
+            on_worker, *arguments, pure=False, key=f"block-{time.monotonic_ns()}",
             workers=others or None, allow_other_workers=bool(others),
         )
 
@@ -309,20 +290,19 @@ class OnCluster(Executor):
 
     def result(self, future: Any) -> Receipt | Failed:
         """Return the receipt, or why there is none."""
-        status, error = future.status, None
         try:
-            if status == "finished":
+            if future.status != "lost":
                 return cast("Receipt | Failed", future.result())  # through the scheduler
-            error = future.exception() if status == "error" else None
-        except OSError:
+        except StoreReplacedError:
+            raise
+        except (OSError, CancelledError):
             raise RunError(AWAY) from None
+        except Exception as error:
+            if not isinstance(error, KilledWorker):
+                return Failed(exception_line(error))
         finally:
             future.release()
-        if isinstance(error, StoreReplacedError):
-            raise error
-        if error is not None and not isinstance(error, KilledWorker):
-            return Failed(exception_line(error))
-        if error is None and (status != "lost" or self._client.status != "running"):
+        if self._client.status != "running":
             raise RunError(AWAY)
         # A block that ends its process is computed in isolation when it is begun again, but it may
         # have been queued behind one, or its workers were killed from outside; or died with its
@@ -337,6 +317,6 @@ class OnCluster(Executor):
                 self._client.cancel(list(out))
 
 
-def on_worker(arguments: tuple[Any, ...]) -> Receipt | Failed:
+def on_worker(*arguments: Any) -> Receipt | Failed:
     """Compute a block on a worker; return its receipt, or why there is none."""
-    return attempt(arguments, get_worker().address)
+    return attempt(compute_block, *arguments, worker=get_worker().address)

@@ -7,7 +7,7 @@ import importlib
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -135,9 +135,6 @@ def execute(
     check_positive("workers", workers, "expected at least 1", whole=True)
     if scheduler is not None and client is not None:
         raise ArgumentError("scheduler", scheduler, "expected no client beside it")
-    if scheduler is not None and ":" not in str(scheduler) and scheduler != "local":
-        raise ArgumentError(
-            "scheduler", scheduler, "expected an address such as tcp://host:8786, or local")
     check_positive("time_limit_s", time_limit_s, "expected seconds above 0")
     reuse = reuse if isinstance(reuse, Sequence) and not isinstance(reuse, str) else [reuse]
     if retry_failed and reuse:
@@ -196,8 +193,15 @@ def execute(
         if stricter or again:  # once nothing refuses the run
             begun = lifecycle.reopen(begun, pipeline if stricter else None, again)
         limit_s = forecast.block_time_limit_s(time_limit_s, timing.pose_s * len(begun.blocks[0]))
-        with _continuable_errors(without=" without overwrite" if overwrite else ""):
+        try:
             computed = compute(begun, executor, sources, limit_s, interrupts, progress)
+        except StoreReplacedError as error:
+            raise RunError(str(error)) from None
+        except (RunError, StoreError) as error:
+            first, *others = str(error).splitlines()
+            without = " without overwrite" if overwrite else ""
+            advice = f"{first}; run it again{without} to continue"
+            raise RunError("\n".join([advice, *others])) from None
     return status.summary_of(
         lifecycle.open_store(url), computed, time.perf_counter() - started, again)
 
@@ -314,27 +318,14 @@ def compute(
                     totals.add(result)
                     report()
             if failed and all(each.machine_fault for each in failed):
-                more = f", and {len(failed) - 1} blocks more likewise" if len(failed) > 1 else ""
-                raise RunError(f"{store.url}: {failed[0].reason}{more}")
+                raise RunError(
+                    f"{store.url}: {len(failed)} blocks failed; {failed[0].reason}")
             if failed:
                 raise RunError("\n  ".join([f"{store.url}: {len(failed)} blocks failed",
                                             *(each.reason for each in failed)]))
         if not store.finished:  # by another process that wrote it, too
             status.close(store)
     return computed
-
-
-@contextlib.contextmanager
-def _continuable_errors(without: str = "") -> Iterator[None]:
-    """Raise RunError for errors after which another run continues, and add how."""
-    try:
-        yield
-    except StoreReplacedError as error:
-        raise RunError(str(error)) from None
-    except (RunError, StoreError) as error:
-        first, *others = str(error).splitlines()
-        advice = f"{first}; run it again{without} to continue"
-        raise RunError("\n".join([advice, *others])) from None
 
 
 # --------------------------------------------------------------------------------------------------

@@ -220,7 +220,7 @@ def close(store: RunStore) -> None:
     totals, costs = Totals(), {}
     for number, receipt in blocks.receipts(store, blocks.check_whole(store, finished=True)):
         totals.add(receipt)
-        if receipt.seconds["scene"]:
+        if any(receipt.seconds["scene"]):
             costs[number] = receipt.seconds
     counts: dict[str, Any] = {
         name: getattr(totals, name) for name in ("detection", "estimate", "processors")}

@@ -66,9 +66,13 @@ class ChildError(Exception):
 
     @property
     def line(self) -> str:
-        """How the process ended, of SIGKILL also what it may mean; of a traceback the last line."""
-        last = str(self).strip().splitlines()[-1]
-        return f"{last}, as where memory runs out: {ADVICE}" if last == "SIGKILL" else last
+        """The last line of the traceback."""
+        return str(self).strip().splitlines()[-1]
+
+    @property
+    def from_outside(self) -> bool:
+        """Whether the process was ended by a signal that no scene's data can cause."""
+        return str(self) in OUTSIDE_SIGNALS
 
 
 class ChildDiedError(ChildError):
@@ -87,9 +91,10 @@ class ChildDiedError(ChildError):
         self.timed_out = timed_out
 
     @property
-    def from_outside(self) -> bool:
-        """Whether a signal ended it that no scene's data can cause."""
-        return str(self) in OUTSIDE_SIGNALS
+    def line(self) -> str:
+        """How the process ended, of SIGKILL also what it may mean."""
+        memory = f", as where memory runs out: {ADVICE}" if str(self) == "SIGKILL" else ""
+        return f"its process ended: {self}{memory}"
 
 
 class ChildRaisedError(ChildError):
@@ -100,7 +105,7 @@ Result = TypeVar("Result")
 
 
 class Child:
-    """A child process that calls functions, one at a time.
+    """A child process that calls functions, one at a time; another one after it ended.
 
     Parameters
     ----------
@@ -131,11 +136,6 @@ class Child:
                 start_new_session=True,  # a terminal's Ctrl-C is the caller's to act on
             )
 
-    def restart(self) -> None:
-        """Start another process in place of one that ended."""
-        self.close()
-        self._start()
-
     def __enter__(self) -> Self:
         return self
 
@@ -165,6 +165,8 @@ class Child:
             If the call raised; a `SweepError` is raised as it is, and a fault of the machine as
             `MachineFaultError`.
         """
+        if self._connection.closed:
+            self._start()
         started = time.monotonic()
         # It bounds sending, too: a child that hangs while it imports reads nothing.
         last = threading.Timer(limit_s + grace_s, self._process.kill)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -26,26 +27,18 @@ from sweep.typing import Masks
 # --------------------------------------------------------------------------------------------------
 # Scenes that crash their process or never return, isolated in child processes.
 #
-# The rest of the block is computed all the same. A block has a time limit T; isolating one scene
-# that never returns keeps within it:
-#
-# - T/4: the block in its worker, before that ends itself (:data:`WHOLE`);
-# - 3 T/16: pieces of the block in a child, cut in 64 up to three times, T/16 each (:data:`PIECE`);
-# - T/8 + T/16 + ... : the parts of the scene that remains, one by one (:data:`PART`): rendering,
-#   each detector setting, each estimator; the limit is halved each time one runs out;
-# - the rest: the first call in each child has more time (:data:`LOADING`); no limit runs while code
-#   is compiled or loaded.
+# The rest of the block is computed all the same. Of a block's time limit, its worker has a quarter,
+# before that ends itself (:data:`WHOLE`). Then each call in a child has a share of what is left
+# (:data:`SHARE`), so that isolating a scene that never returns keeps within the limit; and not less
+# than a share of it all (:data:`LEAST`), since there are other scenes after some that never return.
+# No limit runs while code is compiled or loaded.
 
-#: Shares of a block's time limit: for the block, for a piece of it, for a part of a scene.
-WHOLE, PIECE, PART = 1 / 4, 1 / 16, 1 / 8
-
-#: Additional time of the first call in a child: a share of the limit, at most so many seconds.
-LOADING, LOADING_S = 1 / 16, 15.0
+WHOLE, SHARE, LEAST = 1 / 4, 1 / 6, 1 / 32
 
 #: How many fresh processes a part of a scene must end, one after another, to be flagged.
 DEATHS = 3
 
-#: Least time limit of a part of a scene.
+#: Least time limit of a call.
 MIN_S = 1.0
 
 #: How long a child may take to start and to unpickle the pipeline.
@@ -79,24 +72,31 @@ class _IsolatedCells:
         self, child: Child, pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: Masks,
         limit_s: float,
     ) -> None:
-        self._child, self._fresh = child, True
-        self._pipeline, self._indices, self._need = pipeline, indices, need
-        self._limit_s, self._share = limit_s, PART
+        self._child, self._pipeline, self._indices, self._need = child, pipeline, indices, need
+        self._limit_s, self._end = limit_s, time.monotonic() + (1 - WHOLE) * limit_s
         self.cells = CellsResult.not_run(pipeline.experiment, len(need))
+        self._begin()
+
+    def _begin(self) -> None:
+        """Give a fresh child the pipeline; MachineFaultError if it ends meanwhile."""
+        try:
+            self._child.call(_hold, self._pipeline, limit_s=HOLD_S)
+        except ChildError as error:
+            raise local_fault(f"a child process computed nothing: {error.line}") from None
 
     def compute(self, rows: NDArray[np.intp]) -> None:
         """Compute scenes ``rows`` (n,) in pieces; those that end the process in smaller ones."""
         for piece in np.array_split(rows, min(PIECES, len(rows))):
             try:
-                self._take(piece, self._run(PIECE, piece, self._need[piece]))
+                self._take(piece, self._run(piece, self._need[piece]))
             except ChildError:
                 if len(piece) > 1:
                     self.compute(piece)
                 else:
                     self._compute_scene(int(piece[0]))
 
-    def _run(self, share: float, rows: NDArray[np.intp], *masks: Masks) -> CellsResult:
-        """Call ``run_cells`` for some scenes with a share of the time limit.
+    def _run(self, rows: NDArray[np.intp], *masks: Masks) -> CellsResult:
+        """Call ``run_cells`` for some scenes.
 
         Raises
         ------
@@ -105,21 +105,12 @@ class _IsolatedCells:
         MachineFaultError
             If a child cannot be started, or raises what no scene's data can cause.
         """
-        limit_s = max(share * self._limit_s, MIN_S)
-        if self._fresh:
-            try:
-                self._child.call(_hold, self._pipeline, limit_s=HOLD_S)
-            except ChildError as error:
-                raise local_fault("a child process ended before it computed anything: "
-                                  f"{error.line}") from None
-            self._fresh = False
-            limit_s += min(LOADING * self._limit_s, LOADING_S)
+        limit_s = max(SHARE * (self._end - time.monotonic()), LEAST * self._limit_s, MIN_S)
         try:
             return self._child.call(
                 _run_held, [index[rows] for index in self._indices], *masks, limit_s=limit_s)
         except ChildDiedError:
-            self._fresh = True
-            self._child.restart()
+            self._begin()
             raise
 
     def _take(
@@ -170,7 +161,7 @@ class _IsolatedCells:
         Raises
         ------
         MachineFaultError
-            If two processes are ended by signals from outside, which is no chance.
+            If a process is ended by a signal from outside.
         """
         need = np.zeros_like(self._need[:1])
         search = np.zeros_like(need[..., 0])
@@ -178,25 +169,22 @@ class _IsolatedCells:
             need[0, part.setting, part.estimator] = True
         elif part.setting is not None:
             search[0, part.setting] = True
-        row, own, outside = np.array([part.scene]), list[str](), list[str]()
-        while len(own) < DEATHS:
+        row, lost = np.array([part.scene]), part
+        for _ in range(DEATHS):
             try:
-                computed = self._run(self._share, row, need, search)
+                self._take(row, self._run(row, need, search), part.stage, number)
             except ChildRaisedError as error:
-                self.cells.failures.append(dataclasses.replace(part, text=str(error)))
-                return "failed"
+                lost = dataclasses.replace(part, text=str(error))
+                break
             except ChildDiedError as death:
-                (outside if death.from_outside else own).append(death.line)
-                self._share /= 2 if death.timed_out else 1
-                if len(outside) > 1:
+                if death.from_outside:
                     at = selected(self._pipeline, [int(i[part.scene]) for i in self._indices], part)
-                    raise local_fault("two processes that computed one scene were ended by "
-                                      f"{death.line}; it is --at {at}") from None
+                    raise local_fault(f"{death.line}; the scene is --at {at}") from None
+                lost = dataclasses.replace(part, text=death.line, crashed=True)
             else:
-                self._take(row, computed, part.stage, number)
                 return ""
-        self.cells.failures.append(dataclasses.replace(part, text=own[0], crashed=True))
-        return "crashed"
+        self.cells.failures.append(lost)
+        return "crashed" if lost.crashed else "failed"
 
 
 @machine_faults_raised()
@@ -222,13 +210,13 @@ def run_cells_isolated(
     need
         (N, detector settings, estimators): the cells that are computed.
     limit_s
-        Time limit of the block in seconds, divided as the comment above says.
+        Time limit of the block in seconds, shared as the comment above says.
 
     Raises
     ------
     MachineFaultError
         If no child process can be started, one raises what no scene's data can cause, or one that
-        computes a single scene is ended twice by a signal from outside.
+        computes a single scene is ended by a signal from outside.
     """
     with Child() as child:
         isolated = _IsolatedCells(child, pipeline, indices, need, limit_s)
@@ -297,16 +285,13 @@ def check_plugins(child: Child, pipeline: Pipeline, limit_s: float = LIMIT_S) ->
         If one cannot be imported or made, raises on a blank frame, ends its process, or does not
         return; in one line.
     """
-    names = " or ".join(f"{plugin.kind} {plugin.name}" for plugin in pipeline.plugins)
+    if not pipeline.plugins:
+        return
     try:
-        if names:
-            child.call(use, pipeline, limit_s=limit_s * len(pipeline.plugins))
+        child.call(use, pipeline, limit_s=limit_s * len(pipeline.plugins))
     except ChildError as error:
-        ends = ""
-        if isinstance(error, ChildDiedError):
-            child.restart()
-            ends = "ends its process before the first pose: "
-        raise PluginError(f"{names}: {ends}{error.line}") from None
+        names = " or ".join(f"{plugin.kind} {plugin.name}" for plugin in pipeline.plugins)
+        raise PluginError(f"{names}: {error.line}") from None
 
 
 @single_threaded()
@@ -322,9 +307,8 @@ def use(pipeline: Pipeline) -> None:
     _ = experiment.scene_plugins
     width, height = (min(pipeline.values_of(side)) for side in ("width_px", "height_px"))
     blank = np.full((height, width), 128, dtype=np.uint8)
-    settings = [setting for setting in dict.fromkeys(experiment.detectors)
-                if isinstance(setting, PluginSetting)]
-    searches = itertools.product(pipeline.values_of("dictionary"), settings)
+    searches = itertools.product(pipeline.values_of("dictionary"), (
+        each for each in dict.fromkeys(experiment.detectors) if isinstance(each, PluginSetting)))
     for dictionary, setting in itertools.islice(searches, MAX_SETTINGS):
         make_detector(setting)(blank, dictionary, max(width, height))
     for solver in itertools.islice(dict.fromkeys(experiment.estimators), MAX_SETTINGS):

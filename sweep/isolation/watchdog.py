@@ -13,8 +13,8 @@ from typing import Any
 from numba.core import event
 
 _lock = threading.RLock()
-#: When each limit of this process runs out; several threads may have some at once.
-_deadlines: dict[object, float] = {}
+#: When each limit of this process runs out, by :func:`_clock_s`; several threads may have some.
+_ends: list[float] = []
 _devnull = os.open(os.devnull, os.O_WRONLY)
 
 
@@ -26,51 +26,53 @@ def ending_after(limit_s: float) -> Iterator[None]:
     compiled code that never returns is ended too. The clock stands still while Numba compiles or
     loads code, which takes a minute if nothing is cached. Several threads may have limits at once.
     """
-    mine = object()
     with _lock:
-        _deadlines[mine] = time.monotonic() + limit_s
+        end = _clock_s() + limit_s
+        _ends.append(end)
         _arm()
     try:
         yield
     finally:
         with _lock:
-            del _deadlines[mine]
+            _ends.remove(end)
             _arm()
 
 
 def _arm() -> None:
-    if not _deadlines or _compiling.begun:
+    if not _ends or _compiling.depth:
         faulthandler.cancel_dump_traceback_later()
-        return
-    left = max(min(_deadlines.values()) - time.monotonic(), 0.001)
-    faulthandler.dump_traceback_later(left, exit=True, file=_devnull)
+    else:
+        left_s = max(min(_ends) - _clock_s(), 0.001)
+        faulthandler.dump_traceback_later(left_s, exit=True, file=_devnull)
 
 
 class _Compiling(event.Listener):
-    """Stops the clock while code is compiled."""
+    """Stops the clock while code is compiled; one compilation may begin others."""
 
-    def __init__(self) -> None:
-        self.begun: list[float] = []  # one compilation may begin others
-        self.total_s = 0.0
+    depth, since, total_s = 0, 0.0, 0.0
 
     def on_start(self, _event: object) -> None:
         with _lock:
-            self.begun.append(time.monotonic())
+            self.since = self.since if self.depth else time.monotonic()
+            self.depth += 1
             _arm()
 
     def on_end(self, _event: object) -> None:
         with _lock:
-            took_s = time.monotonic() - self.begun.pop()
-            if not self.begun:
-                self.total_s += took_s
-                for limit in _deadlines:
-                    _deadlines[limit] += took_s
+            self.depth -= 1
+            if not self.depth:
+                self.total_s += time.monotonic() - self.since
             _arm()
 
 
 _compiling = _Compiling()
 _register: Any = event.register
 _register("numba:compile", _compiling)
+
+
+def _clock_s() -> float:
+    """Return seconds without those of compilation, which must not go on."""
+    return time.monotonic() - _compiling.total_s
 
 
 def compilation_s() -> float:

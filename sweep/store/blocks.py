@@ -193,7 +193,7 @@ class Receipt:
     detection, estimate
         How often each flag occurs, by name.
     seconds
-        Stage -> seconds for each configuration; empty where nothing was computed.
+        Stage -> seconds for each configuration; zeros where nothing was computed.
     failures
         The cells that failed or crashed, as far as they are recorded.
     wall_s

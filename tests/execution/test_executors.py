@@ -104,7 +104,7 @@ def compute_in(folder, child):
 @pytest.mark.system
 def test_block_that_ends_its_process_each_time_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(executors, "MAX_ATTEMPTS", 2)
-    monkeypatch.setattr(executors, "attempt", suicide)
+    monkeypatch.setattr(executors, "compute_block", suicide)
     failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out: use "
     with pytest.raises(RunError, match=failed):
         compute_in(tmp_path, Child())

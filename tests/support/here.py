@@ -25,9 +25,6 @@ class Here:
     def close(self):
         pass
 
-    def restart(self):
-        pass
-
 
 @contextlib.contextmanager
 def calls_here():
@@ -35,7 +32,7 @@ def calls_here():
 
     A busy machine does not make a small run a large one, which would start others.
     """
-    own = {name: getattr(Here, name) for name in ("__init__", "call", "close", "restart")}
+    own = {name: getattr(Here, name) for name in ("__init__", "call", "close")}
     with (
         mock.patch.multiple(Child, **own),
         mock.patch("sweep.execution.runner.SMALL_RUN_S", 300.0),

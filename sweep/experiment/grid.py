@@ -527,14 +527,14 @@ class Block:
         return ",".join(f"{a}-{b}" for a, b in pairs) or "all"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Blocks:
     """The grid of scene cells cut into equal boxes, which are made on demand."""
 
     lengths: tuple[int, ...]
     extents: tuple[int, ...]
 
-    @property
+    @cached_property
     def counts(self) -> tuple[int, ...]:
         """Blocks along each scene axis."""
         return tuple(-(-a // b) for a, b in zip(self.lengths, self.extents, strict=True))
@@ -545,12 +545,19 @@ class Blocks:
     def __iter__(self) -> Iterator[Block]:
         return (self[number] for number in range(len(self)))
 
+    def index(self, number: int) -> tuple[int, ...]:
+        """Return a block's indices along the scene axes by its number; the last counts fastest."""
+        found = []
+        for count in reversed(self.counts):
+            number, at = divmod(number, count)
+            found.append(at)
+        return tuple(reversed(found))
+
     def __getitem__(self, number: int) -> Block:
-        """Return a block by its number; the last axis counts fastest."""
-        index = np.unravel_index(number, self.counts) if self.counts else ()
-        starts = np.multiply(index, self.extents).astype(np.int64)
-        stops = np.minimum(starts + self.extents, self.lengths)
-        return Block(tuple(starts.tolist()), tuple(map(int, stops)))
+        """Return a block by its number."""
+        starts = tuple(map(operator.mul, self.index(number), self.extents))
+        stops = map(operator.add, starts, self.extents)
+        return Block(starts, tuple(map(min, stops, self.lengths)))
 
     def number(self, block: Block) -> int:
         """Return the number of a block."""

@@ -90,10 +90,9 @@ def refined_corners(detections: Detections) -> Floats:
     return refined
 
 
-def start_states(
-    rotations: Floats, translations: Floats, middle: Floats, spread_px: float
-) -> Floats:
+def start_states(poses: tuple[Floats, Floats], middle: Floats, spread_px: float) -> Floats:
     """Return the states (K, 18) of a target's middle at the finite ones of some poses."""
+    rotations, translations = poses
     states = np.zeros((len(rotations), likelihood.STATE_LENGTH))
     states[:, likelihood.ROTATION] = rotations.reshape(-1, 9)
     states[:, POSITION] = translations + rotations @ middle
@@ -109,9 +108,7 @@ def first_side_m(detections: Detections, row: int) -> float:
     return float(detections.scale[row]) * unit_m(target) * module_count(target.dictionary)
 
 
-def window_of(
-    detections: Detections, row: int, rotations: Floats, translations: Floats
-) -> list[int]:
+def window_of(detections: Detections, row: int, poses: tuple[Floats, Floats]) -> list[int]:
     """Return the fitted part of a target's image: left, top, right, bottom.
 
     Of a marker its quiet zone, as a share of the corners' extent, and half of that for perspective;
@@ -133,7 +130,7 @@ def window_of(
         camera = detections.cameras.take(np.array([row]))
         pixels = np.concatenate([
             camera.project(transform_points(sheet, rotation[None], translation[None]))[0]
-            for rotation, translation in zip(rotations, translations, strict=True)
+            for rotation, translation in zip(*poses, strict=True)
         ])
         pixels = pixels[np.isfinite(pixels).all(axis=1)]
         if not len(pixels):
@@ -228,10 +225,10 @@ class Photometric:
         """
         noise_grey, blur_px = float(detections.noise_grey[row]), float(detections.blur_px[row])
         spread = max(blur_px, LIKELY_SPREAD_PX) if self.spread_free else blur_px
-        starts = start_states(*poses, middle, spread)
+        starts = start_states(poses, middle, spread)
         if not len(starts):
             return None
-        left, top, right, bottom = window_of(detections, row, *poses)
+        left, top, right, bottom = window_of(detections, row, poses)
         if right - left < 2 or bottom - top < 2:
             return None
         image = detections.images[row][top:bottom, left:right].astype(np.float64)
@@ -287,7 +284,7 @@ class PhotometricReal(Photometric):
         out: Estimates,
     ) -> tuple[Floats, Floats] | None:
         # The first of the two planar solutions of each set of corners: the other one is its mirror.
-        starts = start_states(poses[0][::2], poses[1][::2], middle, FIRST_SPREAD_PX)
+        starts = start_states((poses[0][::2], poses[1][::2]), middle, FIRST_SPREAD_PX)
         target, on_board = detections.targets[row], detections.on_board
         view = photograph_view(
             target, on_board[row] if on_board else None, float(detections.size_m[row]),

@@ -10,7 +10,6 @@ import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from operator import floordiv
 from typing import Any, cast
 
 import numpy as np
@@ -80,7 +79,7 @@ class RunStore:
     def chunk_key(self, name: str, number: int) -> str:
         """Return the key of a variable's chunk of a block."""
         template, _ = self._chunks[name]
-        return template.format(*map(floordiv, self.blocks[number].starts, self.blocks.extents))
+        return template.format(*self.blocks.index(number))
 
     def chunk(self, name: str, values: NDArray[Any]) -> bytes:
         """Return the content of a variable's chunk of a block, as Zarr writes it.

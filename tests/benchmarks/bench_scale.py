@@ -5,8 +5,8 @@
 Many `distributed.Worker`s live in two processes; a block's work is replaced by waiting its time,
 after which a real receipt is written. Blocks are as long as a run of this size would have them.
 The workers' busy share has start and end in it, which count more with few ``--waves`` (blocks a
-worker). The second table is of stores of ``--stored`` committed blocks, of which only receipts are
-made: processor seconds.
+worker). The second table is of stores of ``--stored`` committed blocks, all of whose chunks are one
+file: processor seconds.
 """
 
 import argparse
@@ -37,7 +37,7 @@ from sweep.execution.status import status
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import SINGLE_THREADED, Interrupts
 from sweep.store.blocks import Receipt, committed, receipt_key, receipts
-from sweep.store.files import RECEIPTS, write_files
+from sweep.store.files import write_files
 from sweep.store.lifecycle import create_store, open_store
 
 PROCESSES = 2
@@ -160,10 +160,19 @@ def simulated(count, waves, folder):
 def stored(count, folder):
     """Return processor seconds that a store of ``count`` blocks takes to list, count and open."""
     store = created(count, f"{folder}/stored.zarr")
-    (Path(store.url) / RECEIPTS / "c").mkdir(parents=True, exist_ok=True)
+    home = Path(store.url)
+    names = [variable.name for variable in store.variables]
     for number in range(len(store.blocks)):
-        path = Path(store.url) / receipt_key(number)
-        path.write_bytes(receipt_of(store, number, 2.0).to_bytes())
+        if number % 1000 == 0:  # a file may have so many names
+            chunk = home.parent / f"chunk{number}"
+            chunk.write_bytes(b"x")
+        receipt = home / receipt_key(number)
+        for path in (receipt, *(home / store.chunk_key(name, number) for name in names)):
+            if not path.parent.exists():
+                path.parent.mkdir(parents=True)
+            if path is not receipt:
+                path.hardlink_to(chunk)
+        receipt.write_bytes(receipt_of(store, number, 2.0).to_bytes())
     calls = {
         "open_store": lambda: open_store(store.url),
         "committed": lambda: committed(store),

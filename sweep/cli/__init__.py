@@ -10,15 +10,7 @@ import inspect
 import sys
 from collections.abc import Sequence
 
-from sweep.cli.command import (
-    SESSION,
-    accept_any_text,
-    answer,
-    print_error,
-    print_system_error,
-    printing,
-    quiet_matplotlib,
-)
+from sweep.cli import command
 from sweep.cli.parser import build_parser
 from sweep.errors import SweepError
 from sweep.installation import check_installation
@@ -32,34 +24,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments
         The words after ``sweep`` on the command line; by default this process'.
     """
-    accept_any_text()
-    quiet_matplotlib()
-    parser, _ = build_parser()
-    SESSION.given = list(sys.argv[1:] if arguments is None else arguments)
-    SESSION.flags, SESSION.stopped = {}, "stopped"
+    command.accept_any_text()
+    command.quiet_matplotlib()
+    (parser, _), session = build_parser(), command.SESSION
+    session.given = list(sys.argv[1:] if arguments is None else arguments)
+    session.flags, session.stopped = {}, "stopped"
     try:
         options = parser.parse_args(arguments)
         if options.command is None:
-            with printing():
+            with command.printing():
                 print(parser.format_help(), end="")
             return 0
-        SESSION.flags, SESSION.form = options.flags, getattr(options, "printed", "text")
+        session.flags, session.form = options.flags, getattr(options, "printed", "text")
         check_installation()
         function = options.command.function
         found = function(**{name: getattr(options, name)
                             for name in inspect.signature(function).parameters})
-        with printing():
-            return answer(found)
+        with command.printing():
+            return command.answer(found)
     except SweepError as error:
-        return print_error(error)
+        return command.print_error(error)
     except KeyboardInterrupt:
-        print(SESSION.stopped, file=sys.stderr)
+        print(session.stopped, file=sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()
         return 1
     except (OSError, MemoryError, RuntimeError, ValueError) as error:
-        return print_system_error(error)
+        return command.print_system_error(error)
     finally:
         if arguments is None and "logging" in sys.modules:
             # What the threads of other packages say while the process ends would stand below.

@@ -18,13 +18,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from sweep import library
-from sweep.errors import (
-    ArgumentError,
-    PipelineError,
-    PluginError,
-    StoreError,
-    SweepError,
-)
+from sweep.errors import ArgumentError, PipelineError, PluginError, StoreError, SweepError
 from sweep.messages import notice, plain, quoted
 
 if TYPE_CHECKING:

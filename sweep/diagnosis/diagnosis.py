@@ -8,16 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.diagnosis.inference import (
-    AGREE,
-    CAUSES,
-    DECIDES,
-    Explanation,
-    Measurement,
-    next_measurement,
-    rank,
-    rivals,
-)
+from sweep.diagnosis import inference
 from sweep.diagnosis.observations import READABLE_PX, ZERO_SD_M, Observations, read_observations
 from sweep.model.calibration import Calibration
 from sweep.report.figure import Figure, write_figure
@@ -87,12 +78,12 @@ def diagnose(
     rows = read_observations(
         observations, camera=camera, size_m=size_m, dictionary=dictionary, refinement=refinement,
         zero_sd_m=zero_sd_m, compared=compared)
-    ranked = rank(rows)
+    ranked = inference.rank(rows)
     shown = [each for each in ranked[:SHOWN] if each.probability >= LEAST_SHARE] or ranked[:1]
     if figure is not None:
         write_figure([residual_figure(rows, shown)], figure)
-    first, open_ = ranked[0], rivals(ranked)
-    measurement = next_measurement(rows, first, open_[0]) if open_ else None
+    first, open_ = ranked[0], inference.rivals(ranked)
+    measurement = inference.next_measurement(rows, first, open_[0]) if open_ else None
     sentence = _sentence(rows, first, open_, measurement)
     sizes = [size_of(each, rows) for each in shown]
     causes = Table.of(
@@ -111,11 +102,11 @@ def diagnose(
          *(f"{k}: {each.words('name')}" for k, each in enumerate(shown, 1))),
         [(f"{row[k] + 1}", components[k], f"{value[k]:.4f}",
           *(f"{each.fitted[k]:.4f}" for each in shown)) for k in range(len(row))], stub=2)
-    missing = {cause.title: lack for cause in CAUSES if (lack := cause.lacks(rows))}
+    missing = {cause.title: lack for cause in inference.CAUSES if (lack := cause.lacks(rows))}
     numbers = {
         "sentence": sentence, "decided": not open_,
         "causes": [{
-            "causes": sorted(each.names) or [AGREE], "title": each.words("title"),
+            "causes": sorted(each.names) or [inference.AGREE], "title": each.words("title"),
             "probability": each.probability, "size": size,
             "misfit": float(each.misfit[each.best]), "test": each.words("test", "; "),
             "predicted_m": each.fitted} for each, size in zip(shown, sizes, strict=True)],
@@ -132,7 +123,7 @@ def diagnose(
                     status=UNDECIDED if open_ else 0)
 
 
-def size_of(each: Explanation, rows: Observations) -> str:
+def size_of(each: inference.Explanation, rows: Observations) -> str:
     """Return how large the causes are, with one standard deviation."""
     texts = []
     numbers = zip(each.numbers, np.sqrt(np.diagonal(each.covariance)), strict=True)
@@ -147,8 +138,8 @@ def size_of(each: Explanation, rows: Observations) -> str:
 
 
 def _sentence(
-    rows: Observations, first: Explanation, open_: Sequence[Explanation],
-    measurement: Measurement | None,
+    rows: Observations, first: inference.Explanation, open_: Sequence[inference.Explanation],
+    measurement: inference.Measurement | None,
 ) -> str:
     """Return the answer in one sentence, with what to do."""
     misfit, test = float(first.misfit[first.best]), first.words("test", "; ")
@@ -172,7 +163,7 @@ def _sentence(
     between = f"Cannot tell between {', '.join(names[:-1])} and {names[-1]}: " + (
         "size and focal length are confounded, distances show their product alone; "
         if confounded else "")
-    if measurement.difference < DECIDES:
+    if measurement.difference < inference.DECIDES:
         return (f"{between}no further row of this kind would decide (at best "
                 f"{measurement.difference:.1f} standard deviations); {test}.")
     what = {"distance": "the straight distance", "x": "x, to the right of the optical axis",
@@ -182,7 +173,7 @@ def _sentence(
             f"differ by {measurement.difference:.1f} standard deviations; or {test}.")
 
 
-def residual_figure(rows: Observations, shown: Sequence[Explanation]) -> Figure:
+def residual_figure(rows: Observations, shown: Sequence[inference.Explanation]) -> Figure:
     """Return a figure of measured minus predicted, in standard deviations, by cause and value."""
     value = rows.measured[rows.cells]
     heading = Column("measured - predicted, standard deviations", "residual", level=0.0)

@@ -24,25 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import MachineFaultError
+from sweep.evaluation import results, variables
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.results import (
-    CellsResult,
-    Failure,
-    all_or_each,
-    note_failure,
-    to_dataset_layout,
-)
 from sweep.evaluation.search import SceneBatch, SearchResult, detections_of, scenes_at
-from sweep.evaluation.variables import (
-    DETECTION,
-    ESTIMATION,
-    SCENE,
-    WITHOUT_DETECTION,
-    SceneResults,
-    compared,
-    write,
-)
 from sweep.experiment.draws import CALIBRATED
 from sweep.experiment.experiment import Experiment
 from sweep.experiment.grid import Block
@@ -133,16 +118,16 @@ def detections_for(
 
 def estimates_of(
     seen: Detections, estimator: PoseEstimator, rows: NDArray[np.intp],
-    failures: list[Failure], setting: int, number: int,
+    failures: list[results.Failure], setting: int, number: int,
 ) -> Estimates:
     """Return estimates of the targets of scenes ``rows`` (n,); one by one if the batch raises.
 
     ``setting`` and ``number`` are the detector's and the estimator's, for the failures.
     """
-    parts = all_or_each(
+    parts = results.all_or_each(
         lambda some: estimator(seen if len(some) == len(rows) else seen.take(some)),
         np.arange(len(rows)),
-        lambda i: note_failure(failures, int(rows[i]), "estimation", setting, number),
+        lambda i: results.note_failure(failures, int(rows[i]), "estimation", setting, number),
     )
     return Estimates.concatenate([
         Estimates.none(1, EstimateStatus.failed) if part is None else part for part in parts
@@ -167,7 +152,7 @@ def compute_block(experiment: Experiment, block: Block) -> dict[str, NDArray[Any
     """
     cells = run_cells(experiment, block.indices())
     return {
-        variable.name: to_dataset_layout(
+        variable.name: results.to_dataset_layout(
             variable, experiment.grid, block, cells.columns[variable.name])
         for variable in experiment.variables
     }
@@ -179,7 +164,7 @@ def run_cells(
     indices: Sequence[NDArray[np.intp]],
     need: Masks | None = None,
     search_too: Masks | None = None,
-) -> CellsResult:
+) -> results.CellsResult:
     """Render, detect and estimate scene cells.
 
     Parameters
@@ -217,7 +202,7 @@ def run_cells(
         # Fewer scenes at a time, since their images must be kept.
         frame = max(grid.values_of("width_px")) * max(grid.values_of("height_px"))
         size = max(KEPT_PX // frame, 1)
-    result = CellsResult.not_run(experiment, count)
+    result = results.CellsResult.not_run(experiment, count)
     with single_threaded():
         for at in range(0, max(count, 1), size):
             part = slice(at, at + size)
@@ -231,13 +216,13 @@ def run_cells(
 def _run_batch(
     experiment: Experiment, builds: Sequence[PoseEstimator],
     indices: Sequence[NDArray[np.intp]], need: Masks, searched: Masks, part: slice,
-    result: CellsResult,
+    result: results.CellsResult,
 ) -> None:
     """Write the results of scenes that are in memory together to ``part`` of a result's scenes.
 
     ``need`` and ``searched`` are as in :func:`run_cells`, of these scenes.
     """
-    failures: list[Failure] = []
+    failures: list[results.Failure] = []
     columns = {name: column[:, part] for name, column in result.columns.items()}
     drawn = {variable.name: variable.drawn_as for variable in experiment.drawn}
 
@@ -248,9 +233,10 @@ def _run_batch(
         keep=bool(experiment.solvers_on_pixels),
     )
     asked = batch.values["bound"].broadcast(len(need), np.str_)
-    of_scenes = SceneResults(batch, bounds(batch.scenes, batch.boxes, asked, batch.visible))
+    bound = bounds(batch.scenes, batch.boxes, asked, batch.visible)
+    of_scenes = variables.SceneResults(batch, bound)
     computed = {name: column for name, column in columns.items() if name not in drawn}
-    write(computed, SCENE, of_scenes, 0)
+    variables.write(computed, variables.SCENE, of_scenes, 0)
     for name, key in drawn.items():
         columns[name][0] = batch.values[key].broadcast(len(need))
     spent = time.perf_counter() - start
@@ -259,7 +245,7 @@ def _run_batch(
     for k, each in enumerate(found):
         each.flags = np.where(batch.visible, each.flags, batch.visibility)
         each.flags[~searched[:, k]] = DetectionStatus.not_run
-        write(columns, DETECTION, each, k)
+        variables.write(columns, variables.DETECTION, each, k)
         result.seconds["detection"][k] += each.seconds
         for j, setting in enumerate(experiment.estimators):
             start = time.perf_counter()
@@ -267,9 +253,10 @@ def _run_batch(
             seen = detections_for(setting, batch, each, rows)
             poses = estimates_of(seen, builds[j], rows, failures, k, j)
             number = k * len(builds) + j
-            for name, flag in WITHOUT_DETECTION.items():
+            for name, flag in variables.WITHOUT_DETECTION.items():
                 columns[name][number, need[:, k, j]] = flag
-            write(columns, ESTIMATION, compared(poses, batch.scenes, rows), number, rows)
+            compared = variables.compared(poses, batch.scenes, rows)
+            variables.write(columns, variables.ESTIMATION, compared, number, rows)
             result.seconds["estimation"][number] += time.perf_counter() - start
     result.failures += [
         dataclasses.replace(failure, scene=failure.scene + part.start) for failure in failures

@@ -16,14 +16,8 @@ from numpy.typing import NDArray
 from sweep.evaluation.search import SceneBatch, SearchResult
 from sweep.experiment.parameters import Stage
 from sweep.experiment.schema import BOARD_SCHEMA, PHOTOGRAPH_SCHEMA, SCHEMA
+from sweep.measure import estimation
 from sweep.measure.classify import TargetScenes
-from sweep.measure.estimation import (
-    Estimates,
-    PoseError,
-    pose_error,
-    rotation_difference,
-    squared_deviations,
-)
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.measure.likelihood import Bounds
 from sweep.model.exposure import areas_px
@@ -53,17 +47,17 @@ class EstimationResults:
         (n, 3, 3) target to camera.
     """
 
-    estimates: Estimates
-    error: PoseError
+    estimates: estimation.Estimates
+    error: estimation.PoseError
     true_rotation: Floats
 
 
 def compared(
-    estimates: Estimates, scenes: Scenes, rows: NDArray[np.intp]
+    estimates: estimation.Estimates, scenes: Scenes, rows: NDArray[np.intp]
 ) -> EstimationResults:
     """Return the estimates (n,) of the scenes ``rows`` beside the truth and their errors."""
     rotation, translation = scenes.rotation[rows], scenes.translation[rows]
-    error = pose_error(estimates.rotation, estimates.translation, rotation, translation)
+    error = estimation.pose_error(estimates.rotation, estimates.translation, rotation, translation)
     return EstimationResults(estimates, error, rotation)
 
 
@@ -93,8 +87,9 @@ def _flipped(results: EstimationResults) -> NDArray[np.uint8]:
 
 
 def _alternative_angle_deg(results: EstimationResults) -> Floats:
-    other = rotation_difference(results.estimates.alternative_rotation, results.true_rotation)
-    return np.asarray(np.degrees(np.linalg.norm(other, axis=1)))
+    second = results.estimates.alternative_rotation
+    turn = estimation.rotation_difference(second, results.true_rotation)
+    return np.asarray(np.degrees(np.linalg.norm(turn, axis=1)))
 
 
 def _marker_flags(results: SearchResult) -> NDArray[np.uint8]:
@@ -183,7 +178,7 @@ ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
     "predicted_std": lambda results: np.sqrt(
         np.diagonal(results.estimates.covariance, axis1=1, axis2=2)
     ),
-    "nees": lambda results: squared_deviations(
+    "nees": lambda results: estimation.squared_deviations(
         results.error.rotation_rad, results.error.translation_m, results.estimates.covariance
     ),
     "residual_variance_ratio": lambda results: results.estimates.residual_ratio,

@@ -23,12 +23,7 @@ from sweep.execution.executors import SMALL_RUN_S
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import (
-    Child,
-    ChildDiedError,
-    ChildRaisedError,
-    default_workers,
-)
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, default_workers
 from sweep.isolation.watchdog import compilation_s
 from sweep.messages import byte_count, duration
 from sweep.sampling.rules import Stopping, block_unit, make_rule

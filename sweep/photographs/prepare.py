@@ -19,12 +19,7 @@ from sweep.exchange.answers import Conventions, read_answers
 from sweep.experiment.document import file_text, read_document, refusing, section_of
 from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import PHOTOGRAPHS, SIMULATED
-from sweep.experiment.photographs import (
-    SUFFIX,
-    PhotographRecord,
-    board_document,
-    board_of,
-)
+from sweep.experiment.photographs import SUFFIX, PhotographRecord, board_document, board_of
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import rotation_difference
 from sweep.measure.flags import TruthSource

@@ -23,17 +23,11 @@ from zarr.abc.store import Store
 from zarr.storage import MemoryStore
 
 from sweep.errors import ArgumentError, StoreError, path_of
+from sweep.experiment import schema
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import (
-    LABELS,
-    PHOTOGRAPH_SCHEMA,
-    VARIABLES,
-    fixed_values,
-    with_description,
-)
 from sweep.messages import plain, refusal
 from sweep.model.image_file import IMAGE_SUFFIXES
 from sweep.plugins.loading import RECORDED, recorded_plugins
@@ -106,14 +100,14 @@ def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[Planned
         planned.append(PlannedArray(
             name, array.shape, array.shape,
             "string" if array.dtype == object else array.dtype.str.lstrip("<>|="), dimensions,
-            with_description(name, attributes), None, array, dimensions != (name,)))
+            schema.with_description(name, attributes), None, array, dimensions != (name,)))
     for variable in pipeline.experiment.variables:
         names, shape = variable.dimensions(pipeline), variable.shape(pipeline)
         chunks = tuple(
             scene_extent.get(name, length) for name, length in zip(names, shape, strict=True))
         planned.append(PlannedArray(
             variable.name, shape, chunks, variable.dtype, names,
-            with_description(variable.name, variable.attributes()), variable.fill,
+            schema.with_description(variable.name, variable.attributes()), variable.fill,
             coordinate=bool(variable.drawn_as)))
     count = len(Blocks(tuple(map(len, axes)), extents))
     planned.append(PlannedArray(files.RECEIPTS, (count,), (1,), "string", ("block",), {}))
@@ -141,7 +135,7 @@ def _coordinates(
         for name, length in zip(variable.inner, variable.inner_shape, strict=True)
     }
     for name in sorted(inner):
-        yield name, (name,), LABELS[name] or np.arange(inner[name], dtype=np.int64), {}
+        yield name, (name,), schema.LABELS[name] or np.arange(inner[name], dtype=np.int64), {}
     if any(side is not None for side in pipeline.values_of("side_px")[:1]):
         # It follows from the side: each axis' values along a dimension of their own.
         wanted = {*DISTANCE_PARAMETERS}
@@ -155,8 +149,8 @@ def _coordinates(
             distance, [len(axis) for axis in axes]), {
             "long_name": "depth of the marker's centre along the optical axis", "units": "m"}
     yield from _photographs(pipeline)
-    for name, (value, attributes) in fixed_values(pipeline).items():
-        if name not in VARIABLES:
+    for name, (value, attributes) in schema.fixed_values(pipeline).items():
+        if name not in schema.VARIABLES:
             yield name, (), value, attributes
 
 
@@ -495,7 +489,7 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
     if not finished:
         dataset = _only_committed(store, dataset, done)
     ordered = [
-        each.name for each in (*VARIABLES.values(), *PHOTOGRAPH_SCHEMA)
+        each.name for each in (*schema.VARIABLES.values(), *schema.PHOTOGRAPH_SCHEMA)
         if each.name in dataset.data_vars
     ]
     return dataset[ordered]

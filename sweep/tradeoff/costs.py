@@ -14,15 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from sweep.evaluation import search
 from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import (
-    SceneBatch,
-    SearchResult,
-    detection_sources,
-    detections_of,
-    scenes_at,
-)
 from sweep.experiment.grid import TRIAL
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
@@ -318,7 +312,7 @@ def _prepared(
         batch, searches = _searched(pipeline, indices, most)
         count = len(batch.scenes)
         frames.append(count if len(searches[0].images) else np.nan)
-        for source, found in zip(detection_sources(batch), searches, strict=True):
+        for source, found in zip(search.detection_sources(batch), searches, strict=True):
             rows = np.flatnonzero(found.flags == DetectionStatus.detected)
             detected_share.append(len(rows) / count)
             rows = np.resize(rows, BATCH if len(rows) else 0)
@@ -344,20 +338,20 @@ def _estimate_all(estimator: PoseEstimator, detections: Detections) -> None:
 
 def _searched(
     pipeline: Pipeline, indices: Sequence[Indices], most: int
-) -> tuple[SceneBatch, list[SearchResult]]:
+) -> tuple[search.SceneBatch, list[search.SearchResult]]:
     """Render a condition's visible scenes, and search each once with each setting.
 
     Of more than ``most`` scenes, so many are taken from all over the sample.
     """
-    batch = scenes_at(pipeline.experiment, indices)
+    batch = search.scenes_at(pipeline.experiment, indices)
     visible = np.flatnonzero(batch.visible)
     rows = visible if len(visible) else np.arange(len(batch.scenes))
     if len(rows) > most:
         rows = rows[(2 * np.arange(most) + 1) * len(rows) // (2 * most)]
     if len(rows) < len(batch.scenes):
-        batch = scenes_at(pipeline.experiment, [index[rows] for index in indices])
+        batch = search.scenes_at(pipeline.experiment, [index[rows] for index in indices])
     wanted = np.full((len(rows), len(pipeline.experiment.detectors)), len(visible) > 0)
-    return batch, detections_of(batch, wanted, [], keep=True)[0]
+    return batch, search.detections_of(batch, wanted, [], keep=True)[0]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -389,7 +383,7 @@ def measure_renderers(
     images, in grey levels, over the pixels that the marker covers there. NaN if no scene is
     visible.
     """
-    batches = [scenes_at(pipeline.experiment, indices) for indices in samples]
+    batches = [search.scenes_at(pipeline.experiment, indices) for indices in samples]
     rows = np.flatnonzero(batches[reference].visible)
     if not len(rows):
         unknown = np.full(len(batches), np.nan)

@@ -440,32 +440,32 @@ def verify(
         report = library.verification.repair(store, sample, workers=workers)
     else:
         report = library.verification.verify(store, sample)
-    unstable = [each for each in report.damage if each.where == report.unstable]
-    damaged = [each for each in report.damage if each not in unstable]
-    lines = []
+    lines, damaged = [], report.damage
     for what, damages in (("repaired", report.repaired), ("damaged", damaged)):
         lines += listed(
             [f"{what:9} {plain(each.where, 300)}: {plain(each.what, 300)}" for each in damages],
             f"{what:9} and {len(damages) - MAX_LINES:,} more; --json lists all")
-    lines += [plain(each.what, 600) for each in unstable]
+    if report.unstable:
+        lines.append(f"not deterministic: {plain(report.unstable, 300)}: scenes that were "
+                     "recomputed twice on the same images differ")
     again = f"{report.sampled} scenes recomputed" if report.sampled else (
         f"no scene recomputed ({report.not_sampled})")
-    state = "damaged" if damaged else "not deterministic" if unstable else "sound"
+    state = "damaged" if damaged else "not deterministic" if report.unstable else "sound"
     lines.append(
         f"{report.store}: {state}{'' if report.finished else ', unfinished'}: "
         f"{report.blocks_done:,} of {report.blocks:,} blocks, {report.files:,} files, {again}"
         + (f"; damaged: {len(damaged):,}" if damaged else ""))
     lines += library.processor.differing_processors(report.processors, "blocks")
     url = quoted(store)
-    if unstable and not damaged:
-        then = f"sweep plugins check {quoted(unstable[0].where)}", "tries it on its own"
-    elif report.damage and not repair:
+    if report.unstable and not damaged:
+        then = f"sweep plugins check {quoted(report.unstable)}", "tries it on its own"
+    elif damaged and not repair:
         then = f"sweep verify {url} --repair", "repairs it"
-    elif report.damage:
+    elif damaged:
         then = f"sweep run {url} --overwrite", "computes all of it again"
     else:
         then = f"sweep {'report' if report.finished else 'status'} {url}", ""
-    return findings(lines, report, int(bool(report.damage)), *then)
+    return findings(lines, report, int(bool(damaged or report.unstable)), *then)
 
 
 # --------------------------------------------------------------------------------------------------

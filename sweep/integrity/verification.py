@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -113,8 +113,7 @@ class IntegrityReport:
         Damages; none in a sound store.
     unstable
         The name of a plug-in or setting that gives other answers from call to call, or with the
-        other scenes of a call, if recomputed scenes differ for that reason: no block is damaged. It
-        is last in ``damage``.
+        other scenes of a call, if recomputed scenes differ for that reason: no block is damaged.
     repaired
         Damages that have been repaired.
     processors
@@ -235,11 +234,8 @@ def check_scenes(
     report.sampled = len(scenes)
     computed = _recomputed(pipeline, [scene.cell for scene in scenes])
     damage = _compared(store, scenes, computed)
-    if damage and (part := _changing(pipeline, scenes, computed)):
-        report.unstable = part
-        damage = [Damage(part, f"not deterministic: {part}: scenes that were recomputed twice "
-                               "on the same images differ")]
-    report.damage += damage
+    report.unstable = _changing(pipeline, scenes, computed) if damage else ""
+    report.damage += [] if report.unstable else damage
 
 
 def _drawn(store: RunStore, count: int, sound: Mapping[int, Receipt]) -> list[Scene]:
@@ -413,8 +409,7 @@ def repair(
         If blocks failed.
     """
     before = verify(url, sample)
-    lasting = [each for each in before.damage if before.unstable and each.where == before.unstable]
-    if before.damage == lasting:
+    if not before.damage:
         return before
     numbers = sorted({damage.block for damage in before.damage if damage.block is not None})
     store = lifecycle.open_unchecked(url, "r+")
@@ -427,9 +422,8 @@ def repair(
         execute(pipeline, url, workers=workers, time_limit_s=time_limit_s, yes=True)
     elif before.finished:
         close(store)
-    after = verify(url, 0)
-    after.sampled, after.not_sampled = before.sampled, before.not_sampled
-    after.unstable, after.damage = before.unstable, after.damage + lasting
+    after = replace(verify(url, 0), sampled=before.sampled, not_sampled=before.not_sampled,
+                    unstable=before.unstable)
     remaining = {damage.where for damage in after.damage}
     after.repaired = [damage for damage in before.damage if damage.where not in remaining]
     return after

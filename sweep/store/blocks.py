@@ -119,19 +119,19 @@ class RunStore:
     @property
     def run_metadata(self) -> dict[str, Any]:
         """The metadata of the run: format, run id, fingerprint, environment, dates."""
-        root = files.read_json(self.storage, "zarr.json") or {}
-        return run_metadata_in(root["attributes"])
+        return root_of(self.storage)[1]
 
 
-def run_metadata_in(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's metadata from the attributes of its store, where they are a text of JSON.
+def root_of(storage: Store) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the attributes of a store's root, and the run's metadata, a text of JSON among them.
 
     Raises
     ------
     KeyError, TypeError, ValueError
         If there are none.
     """
-    return dict(json.loads(attributes["sweep"]))
+    attributes = (files.read_json(storage, "zarr.json") or {})["attributes"]
+    return attributes, dict(json.loads(attributes["sweep"]))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -383,11 +383,10 @@ def drop_block(store: RunStore, block: Block) -> None:
 
 def check_not_replaced(store: RunStore) -> None:
     """Raise StoreReplacedError if another run has replaced the store since it was opened."""
-    if is_remote(store.url):
-        current = remote_run_id(store.url)
-    else:
-        root = files.read_json(LocalStore(store.url, read_only=True), "zarr.json")
-        current = run_metadata_in(root["attributes"]).get("run_id") if root else None
+    current = None
+    with contextlib.suppress(KeyError, TypeError, ValueError):
+        current = remote_run_id(store.url) if is_remote(store.url) else (
+            root_of(LocalStore(store.url, read_only=True))[1]["run_id"])
     if current != store.run_id:
         raise StoreReplacedError(
             f"{store.url}: moved, or replaced by another run, while this run was in progress"

@@ -276,8 +276,7 @@ def read_root(url: str, storage: Store) -> tuple[dict[str, Any], dict[str, Any]]
         If it is not a store.
     """
     try:
-        root = files.read_json(storage, "zarr.json") or {}
-        return root["attributes"], blocks.run_metadata_in(root["attributes"])
+        return blocks.root_of(storage)
     except PermissionError as error:
         raise StoreError(f"{url}: cannot be read: {locations.reason_of(error)}") from None
     except UNREADABLE:

@@ -12,22 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import sweep
 from sweep import library
-from sweep.cli.command import (
-    CONTINUES,
-    MAX_LINES,
-    SESSION,
-    Names,
-    Numbers,
-    command,
-    command_line,
-    detected_line,
-    executed,
-    findings,
-    listed,
-    precision_settings,
-    read_pipeline,
-    summarised,
-)
+from sweep.cli import command as cli
+from sweep.cli.command import Names, Numbers
 from sweep.errors import ArgumentError
 from sweep.isolation.child_process import Child
 from sweep.messages import byte_count, duration, plain, quoted
@@ -43,7 +29,7 @@ if TYPE_CHECKING:
 # ``sweep run``.
 
 
-@command("experiments", "sweep/execution/README.md", {
+@cli.command("experiments", "sweep/execution/README.md", {
     "sweep run --example smoke": "writes runs/smoke.zarr, from a pipeline of the package",
     "sweep run pipelines/smoke.toml --set 'tilt_deg=[0, 30, 60]' --store runs/tilts.zarr":
         "runs the same experiment at other tilts"})
@@ -92,8 +78,8 @@ def run(
                             "expected a TOML file, a store, or --example smoke")
     source = pipeline or str(Path(library.__file__).parent / "examples" / f"{example}.toml")
     with Child() as child, library.progress.progress_display() as display:
-        read = read_pipeline(source, settings, precision, max_trials)
-        SESSION.stopped = f"{CONTINUES}, without --overwrite" if overwrite else CONTINUES
+        read = cli.read_pipeline(source, settings, precision, max_trials)
+        cli.SESSION.stopped = cli.CONTINUES + (", without --overwrite" if overwrite else "")
         summary = library.runner.execute(
             read, library.lifecycle.store_of(source, store), workers=workers, scheduler=scheduler,
             reuse=reuse, overwrite=overwrite, retry_failed=retry_failed, yes=yes,
@@ -117,8 +103,8 @@ def run(
         per = ",".join(_conditions(read))
         then = quoted("sweep", "require", summary.store, *read.requirements,
                       *(["--per", per] if per else []))
-    return summarised(
-        summary, f"{poses}, {detected_line(summary)}{speed}", notes, then)
+    return cli.summarised(
+        summary, f"{poses}, {cli.detected_line(summary)}{speed}", notes, then)
 
 
 def _conditions(pipeline: Pipeline) -> list[str]:
@@ -130,7 +116,7 @@ def _conditions(pipeline: Pipeline) -> list[str]:
 # ``sweep plan``.
 
 
-@command("experiments", "pipelines/README.md", {
+@cli.command("experiments", "pipelines/README.md", {
     "sweep plan pipelines/smoke.toml": "shows the grid, memory and time",
     "sweep plan pipelines/smoke.toml --set trial=1000 --workers 16 --json":
         "shows the same of a larger run, as JSON"})
@@ -145,7 +131,7 @@ def plan(
     pipeline, settings, precision, max_trials, workers
         As for `run`.
     """
-    read = read_pipeline(pipeline, settings, precision, max_trials)
+    read = cli.read_pipeline(pipeline, settings, precision, max_trials)
     library.runner.announce_compilation(read)
     facts, listed = read.facts, read.facts.parts
     expected = library.forecast.forecast(read, workers)
@@ -164,9 +150,9 @@ def plan(
     for title, texts in sections.items():
         lines += ["", title, *(f"  {text}" for text in texts)] if texts else []
     lines += [f"warning: the run {line}" for line in expected.objections]
-    words = [*_set([*settings, *precision_settings(precision, max_trials)]),
+    words = [*_set([*settings, *cli.precision_settings(precision, max_trials)]),
              *(["--yes"] if expected.objections else [])]
-    return findings(lines, {
+    return cli.findings(lines, {
         "title": read.title, "camera": facts.camera, "notes": [*facts.notes, *bound],
         "views": facts.view_ranges,
         "dimensions": {axis.name: len(axis) for axis in read.axes},
@@ -238,7 +224,7 @@ def _set(settings: Sequence[str]) -> list[str]:
 PNG = (".png", "")
 
 
-@command("experiments", "pipelines/README.md", {
+@cli.command("experiments", "pipelines/README.md", {
     "sweep show pipelines/smoke.toml --at distance_m=0.3,tilt_deg=45":
         "draws this pose into scene.png",
     "sweep show pipelines/faults.toml --full --plain -o frame.png":
@@ -263,19 +249,19 @@ def show(
     full
         Draw the whole frame instead of the marker's surroundings.
     """
-    read = read_pipeline(pipeline, settings)
+    read = cli.read_pipeline(pipeline, settings)
     library.output_file.figure_file(output, PNG)
     single = library.pipeline.cell(read, ",".join(at))
     scene = library.inspection.inspect_scene(single, whole_frame=full)
     _write_image(output, scene.image, None if plain else scene, read, single)
-    return findings(
+    return cli.findings(
         [f"{output}: {scene.detection.name}, {scene.estimate.name}"],
         {"output": output, "detection": scene.detection, "estimate": scene.estimate,
          "area_px2": scene.area_px, **scene.errors},
         0, quoted("sweep", "plan", pipeline, *_set(settings)))
 
 
-@command("experiments", "sweep/integrity/README.md", {
+@cli.command("experiments", "sweep/integrity/README.md", {
     "sweep repro runs/smoke.zarr --at distance_m=0.3,tilt_deg=45 -o cell.png":
         "prints both values of each variable, and draws the image into cell.png",
     "sweep repro runs/faults.zarr --time-limit 10":
@@ -325,7 +311,7 @@ def repro(
         where = f" --at {quoted(last.at)}" if last.at else ""
         then = f"sweep repro {url}{where} -o scene.png", "draws the cell"
     shown = ("at", "stored", "recomputed", "difference", "exact", "seconds", "failures", "changes")
-    return findings(
+    return cli.findings(
         lines, {"store": store, "cells": [
             {name: getattr(each, name) for name in shown} for each in cells]}, status, *then)
 
@@ -375,7 +361,7 @@ def _write_image(
 # ``sweep status`` and ``sweep verify``: a store.
 
 
-@command("experiments", "sweep/execution/README.md", {
+@cli.command("experiments", "sweep/execution/README.md", {
     "sweep status runs/smoke.zarr": "shows the progress, also of a run in progress",
     "sweep status runs/smoke.zarr --json": "prints the same as JSON"})
 def status(store: str) -> Findings:
@@ -405,16 +391,16 @@ def status(store: str) -> Findings:
         rows["time left"] = duration(state.seconds_left)
     lines = [f"{state.title}: {what}", *(f"  {name:11} {text}" for name, text in rows.items())]
     for kind, cells in (("crashed", state.crashed), ("failed", state.failed)):
-        lines += listed(
+        lines += cli.listed(
             [f"  {kind:11} --at {quoted(cell.at)}  {cell.stage}: {plain(cell.reason, 300)}"
              for cell in cells], f"  {kind:11} and more; --json lists the first 1,000")
     then = state.advice or f"sweep report {quoted(store)}"
     if not state.finished:
         then = f"sweep {'status' if state.being_written else 'run'} {quoted(store)}"
-    return findings([*lines, *state.warnings], vars(state), 0, then)
+    return cli.findings([*lines, *state.warnings], vars(state), 0, then)
 
 
-@command("experiments", "sweep/integrity/README.md", {
+@cli.command("experiments", "sweep/integrity/README.md", {
     "sweep verify runs/smoke.zarr": "checks every file, and recomputes 20 scenes",
     "sweep verify runs/smoke.zarr --repair --sample 100":
         "repairs what is damaged, and recomputes 100 scenes"})
@@ -436,15 +422,15 @@ def verify(
         As for `run`.
     """
     if repair:
-        SESSION.stopped = CONTINUES
+        cli.SESSION.stopped = cli.CONTINUES
         report = library.verification.repair(store, sample, workers=workers)
     else:
         report = library.verification.verify(store, sample)
     lines, damaged = [], report.damage
     for what, damages in (("repaired", report.repaired), ("damaged", damaged)):
-        lines += listed(
+        lines += cli.listed(
             [f"{what:9} {plain(each.where, 300)}: {plain(each.what, 300)}" for each in damages],
-            f"{what:9} and {len(damages) - MAX_LINES:,} more; --json lists all")
+            f"{what:9} and {len(damages) - cli.MAX_LINES:,} more; --json lists all")
     if report.unstable:
         lines.append(f"not deterministic: {plain(report.unstable, 300)}: scenes that were "
                      "recomputed twice on the same images differ")
@@ -465,13 +451,13 @@ def verify(
         then = f"sweep run {url} --overwrite", "computes all of it again"
     else:
         then = f"sweep {'report' if report.finished else 'status'} {url}", ""
-    return findings(lines, report, int(bool(damaged or report.unstable)), *then)
+    return cli.findings(lines, report, int(bool(damaged or report.unstable)), *then)
 
 
 # --------------------------------------------------------------------------------------------------
 # Answers, your camera, other programs, reference.
 
-@command("answers", "sweep/analysis/README.md", {
+@cli.command("answers", "sweep/analysis/README.md", {
     "sweep report runs/smoke.zarr --require 'detection >= 0.9'":
         "writes report.html, which begins with how far that is met",
     "sweep report runs/smoke.zarr -o answer.md --figures figures":
@@ -502,14 +488,14 @@ def report(
     error_model : --error-model FILE
         Also write the error models as JSON, as `sweep error-model` does.
     """
-    if SESSION.form == "json" and library.output_file.standard_stream(Path(output or "")):
+    if cli.SESSION.form == "json" and library.output_file.standard_stream(Path(output or "")):
         raise ArgumentError("json", "", "and the report both go to standard output; choose -o FILE")
     return sweep.write_report(
         store, output, require=requirements, per=per, form=form, figures=figures,
-        error_model=error_model, command=command_line())
+        error_model=error_model, command=cli.command_line())
 
 
-@command("answers", "sweep/analysis/README.md", {
+@cli.command("answers", "sweep/analysis/README.md", {
     "sweep require runs/smoke.zarr 'detection >= 0.2'":
         "exits with 0 if it is met, 1 if it is not, 3 if draws are too few to tell",
     "sweep require runs/smoke.zarr 'detection >= 0.2' --per tilt_deg --markdown":
@@ -540,10 +526,10 @@ def require(
     """
     return sweep.require(
         store, requirements, per=per, at=at, pipeline=pipeline, against=against,
-        every=SESSION.form == "markdown")
+        every=cli.SESSION.form == "markdown")
 
 
-@command("answers", "pipelines/sizes/README.md", {
+@cli.command("answers", "pipelines/sizes/README.md", {
     "sweep size pipelines/sizes/smallest_marker.toml":
         "how large a marker must be, and by which condition the next smaller one fails",
     "sweep size pipelines/sizes/smallest_marker.toml --set search.max_trials=2000 "
@@ -565,8 +551,8 @@ def size(
     limit_s : --seconds S
         Time limit of the measurement of costs, in seconds (default: 20).
     """
-    read = read_pipeline(pipeline, settings)
-    SESSION.stopped = CONTINUES
+    read = cli.read_pipeline(pipeline, settings)
+    cli.SESSION.stopped = cli.CONTINUES
     with library.progress.progress_display() as bar:
         choice = sweep.size(
             read, store=library.lifecycle.store_of(pipeline, store), limit_s=limit_s, progress=bar,
@@ -574,7 +560,7 @@ def size(
     return library.findings.choice_findings(choice)
 
 
-@command("answers", "pipelines/limits/README.md", {
+@cli.command("answers", "pipelines/limits/README.md", {
     "sweep limit pipelines/limits/far.toml --require 'detection >= 0.9' --along distance_m":
         "finds from how far a marker is detected, at each tilt",
     "sweep limit pipelines/limits/far.toml --require 'detection >= 0.9' "
@@ -611,7 +597,7 @@ def limit(
         Draw the limits into this PNG or SVG file.
     """
     figure = library.output_file.figure_file(output)
-    SESSION.stopped = CONTINUES
+    cli.SESSION.stopped = cli.CONTINUES
     with library.progress.progress_display() as display:
         limits = sweep.limit(
             pipeline, require=requirements, along=along, per=per, at_all=at_all,
@@ -622,7 +608,7 @@ def limit(
     return library.findings.limit_findings(limits)
 
 
-@command("answers", "sweep/tradeoff/README.md", {
+@cli.command("answers", "sweep/tradeoff/README.md", {
     "sweep tradeoff runs/tradeoff.zarr --per side_px -o trade.svg":
         "compares the configurations at each size of the marker, with a figure",
     "sweep tradeoff pipelines/tradeoff.toml --criterion range_p95_percent --markdown":
@@ -649,13 +635,13 @@ def tradeoff(
         Draw a figure into this PNG or SVG file.
     """
     if source.lower().endswith(".toml"):
-        SESSION.stopped = CONTINUES
+        cli.SESSION.stopped = cli.CONTINUES
     return sweep.measure_tradeoff(
         source, per=per or (), criterion=criterion, limit_s=limit_s, budget_ms=budget_ms,
         output=output, progress=True)
 
 
-@command("answers", "pipelines/diagnose/README.md", {
+@cli.command("answers", "pipelines/diagnose/README.md", {
     "sweep diagnose rows.csv --camera camera.yaml --set size_m=0.153":
         "ranks the causes of wrong distances, and says what to measure next",
     "sweep diagnose rows.csv --set dictionary=tagStandard41h12 -o residuals.png":
@@ -683,7 +669,7 @@ def diagnose(
         observations, camera=camera, output=output, **library.observations.settings_of(settings))
 
 
-@command("answers", "sweep/analysis/README.md", {
+@cli.command("answers", "sweep/analysis/README.md", {
     "sweep error-model runs/tags.zarr": "writes error_model.json and prints a table",
     "sweep error-model runs/tags.zarr --at solver=ippe_square -o tag.json":
         "writes the models of one solver"})
@@ -711,7 +697,7 @@ def error_model(
     return library.findings.model_findings(data, outputs)
 
 
-@command("answers", "pipelines/calibration/README.md", {
+@cli.command("answers", "pipelines/calibration/README.md", {
     "sweep calibration runs/calibration.zarr": "errors and coverage for 10, 20 and 40 views",
     "sweep calibration runs/calibration.zarr --views 5,20 --coefficients 2":
         "fewer views, and a lens of two coefficients"})
@@ -742,7 +728,7 @@ def calibration(
         library.camera_calibration.calibration_summary(found), quoted(store))
 
 
-@command("your camera", "pipelines/photographs/README.md", {
+@cli.command("your camera", "pipelines/photographs/README.md", {
     "sweep photos shots --camera camera.yaml --board BOARD.toml":
         "compares each marker with the board without it; writes runs/shots.zarr",
     "sweep photos shots --camera calibrate --board BOARD.toml "
@@ -776,22 +762,22 @@ def photos(
     overwrite, workers
         As for `run`.
     """
-    SESSION.stopped = "stopped before anything was computed"
+    cli.SESSION.stopped = "stopped before anything was computed"
     home, name = library.prepare.record_home(store)
     prepared = library.prepare.prepare(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
         name=name, overwrite=overwrite)
-    summary = executed(
+    summary = cli.executed(
         prepared.pipeline, store or str(Path(home) / f"{prepared.pipeline.name}.zarr"),
         prepared.lines, workers, overwrite=overwrite)
     count = prepared.pipeline.size(library.parameters.Stage.detection)
     each = f" with {count} detector settings" if count > 1 else ""
-    return summarised(
+    return cli.summarised(
         summary, f"{prepared.markers:,} markers in {prepared.photographs:,} photographs: "
-        f"{detected_line(summary)}{each}", photographs=prepared.lines)
+        f"{cli.detected_line(summary)}{each}", photographs=prepared.lines)
 
 
-@command("your camera", "pipelines/photographs/README.md", {
+@cli.command("your camera", "pipelines/photographs/README.md", {
     "sweep fit shots --camera camera.yaml --board BOARD.toml":
         "writes scene.toml: blur, sharpening, tone, noise, geometry, print",
     "sweep fit shots --camera calibrate --board BOARD.toml -o webcam.toml":
@@ -841,14 +827,14 @@ def fit(
     then = f"sweep run {quoted(output)}", "simulates this camera"
     if path.suffix.lower() == ".toml" and library.locations.exists(store):
         then = quoted("sweep", "compare", store, output), "simulates the photographs with it"
-    return findings(lines, {
+    return cli.findings(lines, {
         "scene": found.scene, "photographs": found.photographs, "markers": found.markers,
         "terms": [each.as_json() for each in found.terms], "lines": list(found.lines),
         "check": [] if held_out is None else held_out.as_json()["rows"], "output": output,
     }, 0, *then)
 
 
-@command("your camera", "pipelines/photographs/README.md", {
+@cli.command("your camera", "pipelines/photographs/README.md", {
     "sweep compare runs/shots.zarr scene.toml":
         "simulates each marker at its pose with this scene; prints the gaps",
     "sweep compare runs/opencv4.zarr runs/opencv5.zarr":
@@ -882,7 +868,7 @@ def compare(
     output : -o --output FIGURE
         Draw rates and errors of both into this PNG or SVG file.
     """
-    SESSION.stopped = CONTINUES
+    cli.SESSION.stopped = cli.CONTINUES
     return sweep.compare(
         photographs, scene, bins=dict(map(_edges, bins)), output=output, repeats=repeats,
         store=store, workers=workers, overwrite=overwrite, progress=True)
@@ -902,7 +888,7 @@ def _edges(text: str) -> tuple[str, list[float]]:
     return name.strip(), numbers
 
 
-@command("other programs", "sweep/exchange/README.md", {
+@cli.command("other programs", "sweep/exchange/README.md", {
     "sweep export pipelines/smoke.toml images": "writes every image as a whole frame",
     "sweep export runs/smoke.zarr windows --windows":
         "writes the marker's surroundings alone, of the experiment of a store"})
@@ -925,9 +911,9 @@ def export(
     yes
         Export also what takes more than 10 GB, or more than is free on the disk.
     """
-    read = read_pipeline(pipeline, settings)
+    read = cli.read_pipeline(pipeline, settings)
     library.runner.announce_compilation(read)
-    SESSION.stopped = CONTINUES
+    cli.SESSION.stopped = cli.CONTINUES
     with library.progress.stage_display() as stage:
         result = library.export.export(
             read, folder, windowed=windowed, workers=workers, yes=yes,
@@ -939,11 +925,11 @@ def export(
     if result.damaged:
         lines.append(f"{result.damaged:,} were missing or changed, and are written again")
     place = quoted(result.folder)
-    return findings(lines, result, 0, f"sweep score {place} detections.csv",
+    return cli.findings(lines, result, 0, f"sweep score {place} detections.csv",
                     f"{place}/README.md has the conventions")
 
 
-@command("other programs", "sweep/exchange/README.md", {
+@cli.command("other programs", "sweep/exchange/README.md", {
     "sweep score images detections.csv --name mine":
         "compares them with the truth; writes runs/mine.zarr",
     "sweep score images tags.csv --pixel-center 0.5 --corner-order 'TR TL BL BR' --beside":
@@ -982,14 +968,14 @@ def score(
         folder, files, names=names,
         conventions=library.answers.Conventions(pixel_center, corner_order, frame),
         doubled=doubled, beside=beside, settings=settings, overwrite=overwrite)
-    summary = executed(
+    summary = cli.executed(
         scored.pipeline, store or f"runs/{scored.pipeline.name}.zarr", scored.lines, workers,
         overwrite=overwrite)
-    return summarised(
-        summary, f"{summary.poses:,} poses, {detected_line(summary)}", answers=scored.lines)
+    return cli.summarised(
+        summary, f"{summary.poses:,} poses, {cli.detected_line(summary)}", answers=scored.lines)
 
 
-@command("other programs", "pipelines/plugins/README.md", {
+@cli.command("other programs", "pipelines/plugins/README.md", {
     "sweep plugins pyapriltags": "imports one, and lists its settings",
     "sweep plugins check mine:SOLVER": "tries SOLVER of mine.py in this folder"})
 def plugins(
@@ -1025,10 +1011,10 @@ def plugins(
         every = library.loading.installed()
         lines = [f"{each['kind']:10} {each['name']:20} of {each['distribution']}"
                  for each in every]
-        return findings(lines or ["no plug-in is installed"], {"plugins": every}, 0,
+        return cli.findings(lines or ["no plug-in is installed"], {"plugins": every}, 0,
                         "sweep plugins NAME", "describes one, and says whether it can be used")
     found = [plugin.to_json() for plugin in library.loading.described(name)]
-    return findings(
+    return cli.findings(
         [line for plugin in found for line in _plugin_lines(plugin)], {"plugins": found})
 
 
@@ -1057,11 +1043,11 @@ def _checked(report: Any) -> Findings:
     key = "detector" if what["kind"] == "detector" else "solver"
     chosen = shlex.quote(f'{key}="{what["name"]}"')
     then = (f"sweep run PIPELINE --set {chosen}", "measures it on your scenes")
-    return findings(lines, {**what, "findings": report.to_dict("records")},
+    return cli.findings(lines, {**what, "findings": report.to_dict("records")},
                     int(not what["conforms"]), *(then if what["conforms"] else ("", "")))
 
 
-@command("help", "pipelines/README.md", {
+@cli.command("help", "pipelines/README.md", {
     "sweep reference": "lists the subjects: sections of a pipeline, effects, variables, ...",
     "sweep reference camera tilt_deg": "prints the parameters of [camera], and tilt_deg"})
 def reference(names: Sequence[str] = ()) -> Findings:

@@ -16,7 +16,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from sweep.declaration import check_table
-from sweep.errors import ArgumentError
+from sweep.errors import ArgumentError, path_of
 from sweep.experiment.document import file_text
 from sweep.experiment.parameters import PARAMETERS
 from sweep.experiment.pipeline import parse_settings
@@ -206,11 +206,11 @@ def read_observations(
     PipelineError
         A line for each setting that is not known or cannot be.
     """
-    folder = Path() if isinstance(source, Mapping) else Path(source).parent
+    folder = Path() if isinstance(source, Mapping) else Path(path_of("observations", source)).parent
     cells = _cells(source)
     table, settings, notes = _numbers(cells), beliefs(given), list[str]()
     believed = camera if camera is None or isinstance(camera, Calibration) else camera_of_file(
-        os.fspath(camera))
+        path_of("camera", camera))
     if IMAGE in cells:
         images = [folder / name for name in cells[IMAGE]]
         table[CORNERS] = _detected(table, images, settings["dictionary"], settings["refinement"])

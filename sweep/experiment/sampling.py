@@ -217,10 +217,10 @@ _PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
 
 
 def _texts(example: str, least: int = 0) -> Callable[[Any], list[str]]:
-    """Return the reader of a list of at least so many texts."""
+    """Return the reader of a list of texts; of at least one, what reads each text checks it."""
     def read(value: Any) -> list[str]:
-        if not isinstance(value, list) or len(value) < least or not all(
-                isinstance(text, str) for text in value):
+        if not isinstance(value, list) or len(value) < least or not (least or all(
+                isinstance(text, str) for text in value)):
             raise ValueError(f"a list of texts, such as {example}")
         return value
 

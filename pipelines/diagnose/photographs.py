@@ -17,7 +17,7 @@ import xarray as xr
 
 import sweep
 from sweep.analysis.dataset import viewing_angle_of
-from sweep.analysis.intervals import clopper_pearson
+from sweep.analysis.estimator import clopper_pearson
 from sweep.diagnosis.detection import judged, widened
 
 CHANCES = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 1.0)

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis.dataset import DRAWS, axes_of, describes, stored_pipeline
-from sweep.analysis.intervals import DEVIATIONS, wilson
+from sweep.analysis.estimator import DEVIATIONS, wilson
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline

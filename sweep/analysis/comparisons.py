@@ -15,10 +15,9 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis import dataset, estimator, intervals
+from sweep.analysis import dataset, estimator
 from sweep.analysis.dataset import DRAWS, ERROR_INPUTS, QUANTITIES, Poses, Quantity, axes_of
-from sweep.analysis.estimator import INTERVAL, Bins, Columns, Count, Design, Mean, Output, Statistic
-from sweep.analysis.intervals import LEVEL
+from sweep.analysis.estimator import INTERVAL, LEVEL, Bins, Columns, Count, Mean, Output, Statistic
 from sweep.analysis.summaries import DETECTION_RATE, FLIP_RATE
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED, Stage
@@ -244,7 +243,7 @@ class RateDifference(Statistic[Pair]):
             Output(f"{rate}_p_value", "chance that the discordant counts differ so much if the "
                    f"{rate} rates are equal (McNemar, exact)", "1")]
 
-    def arrays(self, columns: Columns[Pair], design: Design) -> Sequence[NDArray[Any]]:
+    def arrays(self, columns: Columns[Pair], design: estimator.Design) -> Sequence[NDArray[Any]]:
         """Return these of the poses that were looked for in both."""
         def pairs(pair: Pair, _: slice) -> list[Masks]:
             first, second = self.reached(pair.first), self.reached(pair.second)
@@ -257,7 +256,7 @@ class RateDifference(Statistic[Pair]):
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = draws / np.maximum(n, 1)
             rates = [(both + one) / n for one in (second, first)]
-            ends = [estimator.outward(intervals.wilson, both + one, n, draws, level)
+            ends = [estimator.outward(estimator.wilson, both + one, n, draws, level)
                     for one in (second, first)]
             margins = ((both + first) * (second + neither)).astype(np.float64) * (
                 (both + second) * (first + neither))
@@ -995,7 +994,7 @@ class SolvedQuantile(Statistic[Poses]):
         """Return the quantile with its interval, and what each unit has below it."""
         return [*super().outputs(), Output(self.below, "", "1", dims=(UNIT,))]
 
-    def arrays(self, columns: Columns[Poses], design: Design) -> Sequence[NDArray[Any]]:
+    def arrays(self, columns: Columns[Poses], design: estimator.Design) -> Sequence[NDArray[Any]]:
         """Return these; without an interval of fewer than `MIN_UNITS` units."""
         def solved(poses: Poses, _: slice) -> list[Floats]:
             errors = self.error(poses)

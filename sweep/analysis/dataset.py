@@ -360,11 +360,8 @@ def image_sides(results: xr.Dataset) -> xr.DataArray:
             "limit needs an axis distance_m or side_px (per= takes any axis for rates)")
     else:
         sides = focal_size_of(results) / distance
-    sides = sides.astype(np.float64)
-    if not (np.isfinite(sides) & (sides > 0)).all():
-        raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "
-                           "the distance and the camera")
-    return sides.drop_vars([name for name, each in sides.coords.items() if is_fixed(each)])
+    return sides.astype(np.float64).drop_vars(
+        [name for name, each in sides.coords.items() if is_fixed(each)])
 
 
 # --------------------------------------------------------------------------------------------------

@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sweep.analysis import dataset
 from sweep.analysis.dataset import DRAWS, Poses, axes_of, bearing_of, in_sight_frame, sight_rotation
-from sweep.analysis.estimator import INTERVAL, Columns, arranged
-from sweep.analysis.intervals import DEVIATIONS
+from sweep.analysis.estimator import DEVIATIONS, INTERVAL, Columns, arranged
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag

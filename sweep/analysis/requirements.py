@@ -21,8 +21,16 @@ from scipy import special
 
 from sweep.analysis import dataset, estimator
 from sweep.analysis.dataset import DRAWS, Poses, as_names, axes_of, describes, each_cell, stacked
-from sweep.analysis.estimator import INTERVAL, Bins, Count, Quantiles, Rate, Statistic, aggregates
-from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor
+from sweep.analysis.estimator import (
+    INTERVAL,
+    LEVEL,
+    Bins,
+    Count,
+    Quantiles,
+    Rate,
+    Statistic,
+    aggregates,
+)
 from sweep.analysis.summaries import LOOKED_FOR, NEES_MEAN, RATIOS, quantiles_of, registered
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.parameters import Stage
@@ -639,7 +647,7 @@ def _of_rate(rate: float, limit: float, level: float) -> float:
     def is_decided(n: float) -> bool:
         # Whole hits, rounded towards the limit.
         hits = math.floor(rate * n) if rate > limit else math.ceil(rate * n)
-        low, high = clopper_pearson(hits, n, level)
+        low, high = estimator.clopper_pearson(hits, n, level)
         return bool(low > limit) if rate > limit else bool(high < limit)
 
     first = bisect.bisect_left(POWERS, True, key=is_decided)
@@ -1060,7 +1068,7 @@ def requirement_limits(
         raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
     count = len(required) * math.prod(results.sizes.get(name, 1) for name in (along, *together))
     table = decide(results, required, [*names, *together, along],
-                   shares=error_shares(looks_factor(looks), count))
+                   shares=error_shares(estimator.looks_factor(looks), count))
     table = table.sortby(along)
     upwards = is_harder_upwards(along, table["keeps"].transpose(along, ...).to_numpy())
     table = table.isel({along: slice(None, None, 1 if upwards else -1)})
@@ -1215,10 +1223,10 @@ def detection_limit(
     Raises
     ------
     ArgumentError
-        For a rate outside (0, 1), and for ``per`` that cannot be kept, or leaves several axes of
-        the size.
+        For a rate outside (0, 1), and for ``per`` that cannot be kept, or leaves none or several
+        axes of the size.
     DatasetError
-        If no axis changes the size, or it is drawn; if the dataset lacks variables of results, has
+        If the size is drawn; if the dataset lacks variables of results, has
         no poses, or a single draw of each.
 
     Notes
@@ -1239,29 +1247,25 @@ def detection_limit(
         per = [name for name in ANGLE_AXES if name in axes]
     per = dataset.kept_dimensions(results, (*as_names(per), *{"dictionary"}.intersection(axes)))
     sides = dataset.image_sides(results)
-    if not sides.dims:
-        raise DatasetError("side_px or distance_m: no axis changes the size in the image; there "
-                           f"are {', '.join(axes) or 'none'}")
     searched = [str(dim) for dim in sides.dims if dim not in per]
     if len(searched) != 1:
+        of_size = ", ".join(map(str, sides.dims)) or "none"
         raise ArgumentError("per", ", ".join(per), "expected all axes of the size but one, which "
-                            f"the limit is along; there are {', '.join(map(str, sides.dims))}")
+                            f"the limit is along; there are {of_size}")
     along, = searched
     found = requirement_limits(results, [f"detection >= {rate:.12g}"], along, per)
     modules = xr.apply_ufunc(
         np.vectorize(module_count), xr.DataArray(dataset.parameter_value(results, "dictionary")))
     smaller = found.attrs["harder"] == "upwards"
-    # Beyond the grid's end at which markers are small the side is 0, beyond the other infinite.
-    sides = sides.drop_vars([name for name in sides.coords if name not in sides.dims]).reindex(
-        {along: [-np.inf, *np.sort(sides[along]), np.inf]})
-    ends = np.where((sides[along] > 0) == smaller, 0.0, np.inf)
-    sides = sides.where(np.isfinite(sides[along]), sides[along].copy(data=ends))
     out = {"reach": found["reach"]}
     for end, words in INTERVAL.items():
         # Where the axis makes markers small as it grows, ends of sides are the other ends.
         other = {"_low": "_high", "_high": "_low"}.get(end, end) if smaller else end
         at = found[other[1:] or "value"].fillna(-np.inf if smaller else np.inf)
-        side = sides.sel({along: at}).where(found["reach"] != Reach.not_run)
+        # Beyond the grid's end at which markers are small the side is 0, beyond the other infinite.
+        beyond = xr.where((at > 0) == smaller, 0.0, np.inf)
+        side = sides.sel({along: at.where(np.isfinite(at), sides[along][0])}).where(
+            np.isfinite(at), beyond).where(found["reach"] != Reach.not_run)
         meaning = f"{words}smallest side from which on the detection rate is at least {rate:g}"
         out |= {
             f"side_px{end}": side.assign_attrs(long_name=meaning, units="px"),
@@ -1535,7 +1539,8 @@ class WantedPrecision:
         # Too many poses are lost for a quantile: it is infinite, which is all there is to know.
         half = half.where(low != np.inf, 0.0)
         # Even the upper end of the share of poses with a number gives too few draws of all trials.
-        share = used.copy(data=clopper_pearson(used, np.maximum(run, used), NEVER_LEVEL)[1])
+        most = np.maximum(run, used)
+        share = used.copy(data=estimator.clopper_pearson(used, most, NEVER_LEVEL)[1])
         worth = (draws / np.maximum(used, 1)).where(used > 0, 1.0)
         too_rare = (share * total * worth < self.least_draws) & (total >= self.least_draws)
         narrow = (half <= self.half_width) & (draws >= (1 if what.exact else MIN_MEAN_DRAWS))

@@ -16,8 +16,7 @@ from scipy import special, stats
 
 from sweep.analysis import dataset, estimator
 from sweep.analysis.dataset import DRAWS, QUANTITIES, Poses, Quantity, as_names, describes, stacked
-from sweep.analysis.estimator import INTERVAL, Bins, Count, Mean, Rate, Statistic, aggregate
-from sweep.analysis.intervals import LEVEL
+from sweep.analysis.estimator import INTERVAL, LEVEL, Bins, Count, Mean, Rate, Statistic, aggregate
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import POSE_PARAMETERS, cf_attributes
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, flag, outcomes
@@ -81,7 +80,7 @@ def detection_rate(
     Notes
     -----
     95 % intervals over the random draws, conditional on the grid; NaN if no cell has two draws.
-    See `sweep.analysis.intervals` for the formulas and their sources.
+    See `sweep.analysis.estimator` for the formulas and their sources.
 
     Examples
     --------
@@ -832,7 +831,7 @@ def ambiguity(
     Notes
     -----
     Each interval has 95 % for itself, over the random draws, conditional on the grid: Clopper and
-    Pearson's (`sweep.analysis.intervals.clopper_pearson`), NaN if no cell has two draws. A
+    Pearson's (`sweep.analysis.estimator.clopper_pearson`), NaN if no cell has two draws. A
     threshold that was chosen because few flips were seen below it would look better than it is:
     it is therefore chosen by the upper ends of all thresholds together (Bonferroni: a tail of
     2.5 % over their number), so that a choice whose true flip rate is above the wanted one has a

@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 
 from sweep.analysis import simulation_gap
 from sweep.analysis.comparisons import GAP_STATISTICS
-from sweep.analysis.intervals import TAIL
+from sweep.analysis.estimator import TAIL
 from sweep.errors import ArgumentError
 from sweep.execution.runner import execute
 from sweep.experiment.document import document_text, read_document

@@ -17,7 +17,7 @@ import xarray as xr
 from sweep.analysis import error_statistics
 from sweep.analysis.comparisons import paired_tables
 from sweep.analysis.dataset import QUANTITIES, SIZE_AXES, is_grid_axis, of_photographs
-from sweep.analysis.intervals import LEVEL
+from sweep.analysis.estimator import LEVEL
 from sweep.analysis.requirements import ANGLE_AXES, SIZES_BESIDE, conditions, parse_requirements
 from sweep.errors import StoreError, SweepError, texts_of
 from sweep.execution.status import Totals, account_of

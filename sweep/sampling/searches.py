@@ -14,8 +14,7 @@ from scipy import special
 
 from sweep.analysis import requirements as decisions
 from sweep.analysis.dataset import ERROR_INPUTS, ESTIMATE_INPUTS
-from sweep.analysis.estimator import draws_to_see
-from sweep.analysis.intervals import looks_factor
+from sweep.analysis.estimator import draws_to_see, looks_factor
 from sweep.analysis.requirements import Decision, ErrorShares, Requirable, Requirement
 from sweep.experiment.document import SEARCH
 from sweep.experiment.grid import TRIAL, Block

@@ -83,7 +83,7 @@ def test_an_axis_of_sides_may_have_their_distances():
 
 
 @pytest.mark.parametrize(("results", "per", "error", "problem"), [
-    (dataset({"tilt_deg": [0.0, 10.0]}, [1.0, 1.0]), None, DatasetError, "no axis changes"),
+    (dataset({"tilt_deg": [0.0, 10.0]}, [1.0, 1.0]), None, ArgumentError, "there are none"),
     *((dataset({"distance_m": [1.0, 2.0], "size_m": [0.1, 0.2]}, np.ones((2, 2)), marker=""), per,
        ArgumentError, "but one") for per in ([], ["distance_m", "size_m"])),
     (dataset({"tilt_deg": [0.0]}, [1.0], pose="distance_m = { uniform = [1, 5] }").assign_coords(

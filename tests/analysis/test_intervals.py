@@ -7,7 +7,7 @@ import pytest
 from mpmath import mp, mpf
 
 from support.lengths import lengths
-from sweep.analysis.intervals import clopper_pearson, wilson
+from sweep.analysis.estimator import clopper_pearson, wilson
 
 METHODS = pytest.mark.parametrize("interval", [wilson, clopper_pearson])
 MAX_N = 10**15

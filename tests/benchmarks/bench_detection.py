@@ -17,7 +17,7 @@ import numpy as np
 import sweep
 from benchmarks.tables import header, row
 from sweep.analysis.dataset import viewing_angle_of
-from sweep.analysis.intervals import clopper_pearson
+from sweep.analysis.estimator import clopper_pearson
 from sweep.diagnosis.detection import error_model, estimated
 from sweep.experiment.pipeline import Pipeline
 

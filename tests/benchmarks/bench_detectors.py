@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from benchmarks.tables import header, row
-from sweep.analysis.intervals import wilson
+from sweep.analysis.estimator import wilson
 from sweep.conformance.check import trial_pipeline
 from sweep.evaluation.search import scenes_at
 from sweep.isolation.child_process import Child, ChildDiedError

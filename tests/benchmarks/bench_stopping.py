@@ -19,7 +19,7 @@ import numpy as np
 
 import sweep
 from sweep.analysis import error_statistics, precision_reached
-from sweep.analysis.intervals import wilson
+from sweep.analysis.estimator import wilson
 from sweep.experiment.pipeline import Pipeline
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sweep.analysis.intervals import clopper_pearson
+from sweep.analysis.estimator import clopper_pearson
 from sweep.diagnosis.inference import (
     CAUSES,
     CLEAR_ODDS,

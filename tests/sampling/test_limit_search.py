@@ -7,7 +7,7 @@ import pytest
 from scipy import special, stats
 
 from support.searches import searched, true_limits
-from sweep.analysis.intervals import looks_factor
+from sweep.analysis.estimator import looks_factor
 from sweep.analysis.requirements import Decision
 from sweep.experiment.sampling import wave_ends
 from sweep.report.findings import limit_table, limits_as_json

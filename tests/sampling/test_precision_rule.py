@@ -6,8 +6,7 @@ from scipy import stats
 
 from support.searches import flags_of, needed_by
 from support.small_datasets import perfect
-from sweep.analysis.estimator import stopped_level
-from sweep.analysis.intervals import LEVEL, clopper_pearson
+from sweep.analysis.estimator import LEVEL, clopper_pearson, stopped_level
 from sweep.analysis.requirements import Reached, precision_reached, wanted_precisions
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus

@@ -10,8 +10,7 @@ from scipy import stats
 
 from support.searches import flags_of, needed_by
 from sweep.analysis.dataset import Poses
-from sweep.analysis.estimator import Columns, Design
-from sweep.analysis.intervals import LEVEL
+from sweep.analysis.estimator import LEVEL, Columns, Design
 from sweep.analysis.requirements import wanted_precisions
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, Flipped

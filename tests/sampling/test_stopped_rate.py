@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
-from sweep.analysis.estimator import TAIL_SHARE, stopped_level
-from sweep.analysis.intervals import LEVEL, clopper_pearson
+from sweep.analysis.estimator import LEVEL, TAIL_SHARE, clopper_pearson, stopped_level
 from sweep.experiment.sampling import wave_ends
 
 

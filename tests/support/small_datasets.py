@@ -8,7 +8,7 @@ import tomlkit
 import xarray as xr
 from scipy import special
 
-from sweep.analysis.intervals import wilson
+from sweep.analysis.estimator import wilson
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 VALUES = {

@@ -1263,7 +1263,7 @@ def detection_limit(
         other = {"_low": "_high", "_high": "_low"}.get(end, end) if smaller else end
         at = found[other[1:] or "value"].fillna(-np.inf if smaller else np.inf)
         # Beyond the grid's end at which markers are small the side is 0, beyond the other infinite.
-        beyond = xr.where((at > 0) == smaller, 0.0, np.inf)
+        beyond = at.copy(data=np.where((at > 0) == smaller, 0.0, np.inf))
         side = sides.sel({along: at.where(np.isfinite(at), sides[along][0])}).where(
             np.isfinite(at), beyond).where(found["reach"] != Reach.not_run)
         meaning = f"{words}smallest side from which on the detection rate is at least {rate:g}"

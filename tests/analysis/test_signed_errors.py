@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from support.small_datasets import ALL, mixed, perfect
 from sweep.analysis import error_statistics
-from sweep.analysis.dataset import SIGNED, SignedErrors
+from sweep.analysis.dataset import SIGNED, Poses
 from sweep.errors import ArgumentError
 from sweep.measure.flags import EstimateStatus, Flipped
 
@@ -27,8 +27,9 @@ class Truth:
         self.error = Rotation.from_rotvec(size_rad * axis)
         self.moved = rng.normal(size=(count, 3)) * size_rad
         self.estimate = self.error * self.rotation
-        self.found = SignedErrors(
-            self.rotation.as_rotvec(), self.position, size_rad * axis, self.moved)
+        self.found = Poses({
+            "true_rvec": self.rotation.as_rotvec(), "true_tvec_m": self.position,
+            "rotation_error_rad": size_rad * axis, "translation_error_m": self.moved})
 
 
 def normal_of(rotation):
@@ -95,7 +96,7 @@ COLUMNS = {
         ("camera_in_marker_", "of_camera_m")) for k, axis in enumerate("xyz")},
     **{name: ("yaw_pitch_roll_deg", k) for k, name in enumerate(("yaw", "pitch", "roll"))},
     **{name: (f"{name}_deg", None) for name in ("tilt", "viewing_angle", "in_plane")}}
-"""Where `SignedErrors`, which the tests above compare with SciPy, has the error of a name."""
+"""Where `Poses`, which the tests above compare with SciPy, has the error of a name."""
 
 
 @pytest.mark.parametrize("per", [(), ("tilt_deg", "solver")])
@@ -105,7 +106,7 @@ def test_bias_and_spread_are_those_of_plain_arithmetic(per):
         results["flipped"] != Flipped.flipped)
     wide, = xr.broadcast(results[["true_rvec", "true_tvec_m", "rotation_error_rad",
                                   "translation_error_m"]].astype(float))
-    signed = SignedErrors(*(wide[name].transpose(*used.dims, "xyz").values for name in wide))
+    signed = Poses({name: wide[name].transpose(*used.dims, "xyz").values for name in wide})
     over = [dim for dim in used.dims if dim not in per]
     answer = error_statistics(results, per, quantities=list(SIGNED))
     assert not [name for name in answer if name.startswith(("rotation", "range", "position"))]

@@ -165,6 +165,15 @@ def camera_calibrations(
     )
 
 
+#: Variables of their summary: meaning, units.
+SUMMARY = {
+    "bias": ("mean error", "px, 1"), "rmse": ("root mean square error", "px, 1"),
+    "mean_std": ("root mean square of the reported standard deviations", "px, 1"),
+    "coverage": ("share of reported 95 % intervals that hold the truth", "1"),
+    "position_rmse_m": ("root mean square error of a target's position", "m"),
+}
+
+
 @describes
 def calibration_summary(calibrated: xr.Dataset) -> xr.Dataset:
     """Return how good calibrations are, over their sets.
@@ -206,30 +215,23 @@ def calibration_summary(calibrated: xr.Dataset) -> xr.Dataset:
     >>> float(calibration_summary(one)["coverage"][0])
     0.5
     """
+    def squared_mean(values: xr.DataArray) -> xr.DataArray:
+        return (values**2).mean("set") ** 0.5
+
     solved = calibrated["calibration"] == CalibrationStatus.calibrated
-    tried = calibrated["calibration"] != CalibrationStatus.not_run
-    error = calibrated["intrinsic_error"].where(solved)
-    std = calibrated["intrinsic_std"].where(solved)
-    free = (std > 0).any("set")
+    error, std = (calibrated[name].where(solved) for name in ("intrinsic_error", "intrinsic_std"))
+    free, count = (std > 0).any("set"), solved.sum("set")
     held = ((abs(error) <= DEVIATIONS * std) & solved).sum("set")
-    count = solved.sum("set")
     low, high = xr.apply_ufunc(wilson, held, count, output_core_dims=[[], []])
-    with_sets = count.where(count > 0)
+    found = {
+        "tried": (calibrated["calibration"] != CalibrationStatus.not_run).sum("set"),
+        "calibrated": count, "bias": error.mean("set"), "rmse": squared_mean(error),
+        "mean_std": squared_mean(std), "coverage": (held / count.where(count > 0)).where(free),
+        "coverage_low": low.where(free), "coverage_high": high.where(free),
+        "position_rmse_m": squared_mean(calibrated["position_error_m"])}
     return xr.Dataset({
-        "tried": tried.sum("set"),
-        "calibrated": count,
-        "bias": error.mean("set").assign_attrs(cf_attributes("mean error", "px, 1")),
-        "rmse": ((error**2).mean("set") ** 0.5).assign_attrs(
-            cf_attributes("root mean square error", "px, 1")),
-        "mean_std": ((std**2).mean("set") ** 0.5).assign_attrs(cf_attributes(
-            "root mean square of the reported standard deviations", "px, 1")),
-        "coverage": (held / with_sets).where(free).assign_attrs(cf_attributes(
-            "share of reported 95 % intervals that hold the truth", "1")),
-        "coverage_low": low.where(free & (count > 0)),
-        "coverage_high": high.where(free & (count > 0)),
-        "position_rmse_m": ((calibrated["position_error_m"] ** 2).mean("set") ** 0.5).assign_attrs(
-            cf_attributes("root mean square error of a target's position", "m")),
-    }, attrs=calibrated.attrs)
+        name: array.assign_attrs(cf_attributes(*SUMMARY[name]) if name in SUMMARY else {})
+        for name, array in found.items()}, attrs=calibrated.attrs)
 
 
 def _views(

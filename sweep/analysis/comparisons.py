@@ -352,9 +352,9 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     Raises
     ------
     ArgumentError
-        If ``reference`` is not a renderer of the dataset.
+        If the dataset has no dimension ``renderer``, or not the renderer ``reference``.
     DatasetError
-        If the dataset has no dimension ``renderer``, lacks variables of results, or has no poses.
+        If the dataset lacks variables of results, or has no poses.
 
     Notes
     -----
@@ -367,7 +367,7 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     >>> renderer_bias(both)["detection_disagreement"].values.tolist()
     [0.0, 0.0]
     """
-    dataset.require_dimension(results, "renderer")
+    dataset.kept_dimensions(results, ["renderer"])
     renderers = [str(name) for name in results["renderer"].values]
     if reference not in renderers:
         raise ArgumentError("reference", reference, f"the renderers are {', '.join(renderers)}")
@@ -400,11 +400,12 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
                 pair.second["rotation_error_rad"], pair.first["rotation_error_rad"],
                 dtype=np.float64)))[..., None],
             lambda pair: pair.first.unflipped & pair.second.unflipped, units=ROTATION.units)]
-    detections = estimator.aggregate(
+    detections, = estimator.aggregates(
         results, paired_arrays(others, results, *dataset.DETECTION_INPUTS, corners),
-        kept("detection"), of_detections, Pair)
-    return detections.drop_vars("draws").assign(estimator.aggregate(
-        results, paired_arrays(others, results, *ERROR_INPUTS), kept("estimate"), of_poses, Pair))
+        kept("detection"), [of_detections], Pair)
+    poses, = estimator.aggregates(
+        results, paired_arrays(others, results, *ERROR_INPUTS), kept("estimate"), [of_poses], Pair)
+    return detections.drop_vars("draws").assign(poses)
 
 
 def _corner_shift(pair: Pair, corners: str) -> Floats:
@@ -879,10 +880,9 @@ def _with_axis(results: xr.Dataset, other: xr.Dataset, name: str) -> xr.Dataset:
     """Return a dataset with an axis of its one value, if it has none and the other has one."""
     if name in results.dims:
         return results
-    value = dataset.parameter_value(results, name) if name in PARAMETERS else None
-    value = value.item() if isinstance(value, xr.DataArray) else value
-    if value is None:
+    if name not in PARAMETERS:
         raise DatasetError(f"{name}: one of both does not have this axis; measure both with it")
+    value = np.asarray(dataset.parameter_value(results, name)).item()
     if other[name].dtype.kind in "OU":
         value = label(value)
     return results.drop_vars(name, errors="ignore").expand_dims({name: [value]})
@@ -1094,12 +1094,11 @@ def simulation_gap(
     ([1.0], [[13], [13]])
     """
     sides = matched_sides(photographs, simulated, bins)
-    tables = [
-        estimator.aggregate(side, dataset.pose_arrays(side, ERROR_INPUTS), sides.kept,
-                            [*COUNTS, *GAP_STATISTICS], Poses, sides.bins, stopped=False)
-        for side in sides.datasets]
-    tables = [table.drop_vars([name for name, value in table.coords.items() if not value.dims])
-              for table in tables]
+    tables = [table for side in sides.datasets for table in estimator.aggregates(
+        side, dataset.pose_arrays(side, ERROR_INPUTS), sides.kept, [[*COUNTS, *GAP_STATISTICS]],
+        Poses, sides.bins, stopped=False)]
+    first, second = (table.drop_vars([
+        name for name, value in table.coords.items() if not value.dims]) for table in tables)
     gaps: dict[str, xr.DataArray] = {}
     for each in GAP_STATISTICS:
         words = "simulated over photographs" if each.ratio else "simulated minus photographs"
@@ -1108,9 +1107,9 @@ def simulation_gap(
         with np.errstate(divide="ignore", invalid="ignore"):
             gaps |= {output.name: array.assign_attrs(cf_attributes(output.meaning, output.units))
                      for output, array in zip(outputs, _gap(
-                         each, *tables, paired=sides.paired), strict=True)}
-    tables = [table.drop_dims(UNIT) for table in tables]
-    both = xr.concat(tables, "source", coords="minimal", compat="override", join="override")
+                         each, first, second, paired=sides.paired), strict=True)}
+    both = xr.concat([first.drop_dims(UNIT), second.drop_dims(UNIT)], "source", coords="minimal",
+                     compat="override", join="override")
     return both.assign(gaps).assign_coords(source=list(SOURCES)).assign_attrs(
         paired=int(sides.paired))
 

@@ -166,12 +166,15 @@ def require_poses(results: xr.Dataset) -> None:
         raise DatasetError(f"there are no poses: {', '.join(empty)} has no values")
 
 
-def require_dimension(results: xr.Dataset, name: str) -> None:
-    """Raise DatasetError unless a dataset has a dimension, the variables of results, and poses."""
-    require_poses(results)
-    axes = axes_of(results)
-    if name not in axes:
-        raise DatasetError(f"{name}: no such dimension; there are {', '.join(axes) or 'none'}")
+def require_draws(results: xr.Dataset, kept: Sequence[str]) -> None:
+    """Raise unless there are draws to make intervals of."""
+    if DRAWS in kept:
+        raise ArgumentError("per", DRAWS, "intervals are over the draws; they cannot be kept")
+    if results.sizes.get(DRAWS, 1) < 2:
+        raise DatasetError(
+            "trial: this store has a single draw of each pose, so that nothing tells how far its "
+            "numbers are chance; give the pipeline something drawn (jitter_px = 0.5, noise_grey) "
+            "and trial = 100 under [axes], and run it again")
 
 
 def each_cell(

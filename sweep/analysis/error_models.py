@@ -666,7 +666,7 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
             if name != DRAWS and (name == "dictionary" or not dataset.is_grid_axis(name, results))]
     dataset.kept_dimensions(results, kept)
     inputs = dataset.pose_arrays(results, dataset.SIGNED_INPUTS)
-    _check_drawn(results)
+    dataset.require_draws(results, kept)
     focal_size = dataset.focal_size_of(results)
     halves = (results[DRAWS] % HALVES).astype(np.int64).reset_coords(drop=True).drop_vars(DRAWS)
     columns = arranged(results, {**inputs, HALF: halves, FOCAL_SIZE: focal_size}, kept)[0]
@@ -746,16 +746,6 @@ def _at_knots(
         fit = fit_error(sums, hat_basis(sums.at, of_error), differences(of_error))
         fits.append(fit.at(hat_basis(points, of_error)))
     return np.stack(fits, axis=1)
-
-
-def _check_drawn(results: xr.Dataset) -> None:
-    """Raise DatasetError unless there are two halves of draws."""
-    trials = results.sizes.get(DRAWS, 1)
-    if trials < HALVES or len(set((np.asarray(results[DRAWS].values) % HALVES).tolist())) < HALVES:
-        raise DatasetError(
-            f"{DRAWS} has {'1 value' if trials == 1 else 'no even or no odd values'}: an error "
-            "model is fitted to some random draws and checked on others; run with 50 trials or "
-            "more, and with something drawn, such as azimuth_deg = { uniform = [0, 360] }")
 
 
 def _check_solved(moments: Floats, results: xr.Dataset, kept: Sequence[str]) -> None:

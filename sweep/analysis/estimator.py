@@ -1,6 +1,6 @@
 """One estimator: statistics of poses by group, each with an interval that holds for its draws.
 
-`aggregate` arranges a dataset's columns as (groups, cells, draws, settings, ...). A group is one
+`aggregates` arranges a dataset's columns as (groups, cells, draws, settings, ...). A group is one
 row of the table; its cells are a fixed grid, the draws of a cell are random, and the settings of a
 draw see the same images, so that together they count as one draw. A statistic is a record: it
 sums what it needs of each draw, and makes of these sums a value and its interval.
@@ -1129,23 +1129,23 @@ def bin_coordinates(results: xr.Dataset, edges: Edges) -> dict[str, Any]:
 # --------------------------------------------------------------------------------------------------
 # Statistics of all poses of a dataset, by group: the one way to a table.
 
-def aggregate(
+def aggregates(
     results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str],
-    statistics: Sequence[Statistic[ViewT]], view: Callable[[Arrays], ViewT],
+    sets: Sequence[Sequence[Statistic[ViewT]]], view: Callable[[Arrays], ViewT],
     bins: Bins | None = None, *, stopped: bool | None = None,
-) -> xr.Dataset:
-    """Return the statistics of the poses of each combination of ``kept`` and of bins.
+) -> list[xr.Dataset]:
+    """Return a table of the poses of each combination of ``kept`` and of bins, for each set.
 
     Parameters
     ----------
     results
         The dataset whose coordinates and variables are kept and binned.
     inputs
-        The arrays, by name, of which ``view`` makes the poses that the statistics read.
+        The arrays, by name, of which ``view`` makes the poses that the statistics read: once.
     kept
-        The dimensions of the table; all others are pooled.
-    statistics
-        What to compute.
+        The dimensions of the tables; all others are pooled.
+    sets
+        What to compute: the statistics of each table.
     view
         Makes the view from a block's arrays, (groups, cells, draws, settings, ...).
     bins
@@ -1155,7 +1155,7 @@ def aggregate(
 
     Returns
     -------
-    xr.Dataset
+    list of xr.Dataset
         A variable (*kept, *bins) for each output, computed.
 
     Raises
@@ -1163,15 +1163,6 @@ def aggregate(
     ArgumentError
         For bins that cannot be.
     """
-    return aggregates(results, inputs, kept, [statistics], view, bins, stopped=stopped)[0]
-
-
-def aggregates(
-    results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str],
-    sets: Sequence[Sequence[Statistic[ViewT]]], view: Callable[[Arrays], ViewT],
-    bins: Bins | None = None, *, stopped: bool | None = None,
-) -> list[xr.Dataset]:
-    """Return a table as `aggregate` for each of several sets of statistics, of poses read once."""
     edges = read_bins(results, kept, bins or {})
     binned = {f"{PREFIX}{name}": results[name] for name in edges}
     columns, design = arranged(results, {**inputs, **binned}, kept, stopped=stopped)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import dataclasses
 import functools
 import itertools
@@ -488,7 +487,7 @@ def decide(
     """
     configuration = dataset.configuration_axes(results)
     kept = dataset.kept_dimensions(results, (*configuration, *as_names(per)))
-    require_draws(results, kept)
+    dataset.require_draws(results, kept)
     count = len(required) * math.prod([
         *(len(edges) - 1 for edges in (bins or {}).values()),
         *(results.sizes[name] for name in kept if name not in configuration)])
@@ -518,17 +517,6 @@ def decide(
         units=("requirement", [each.units for each in quantities]))
     return out.assign(looked_for=poses["looked_for"], solved=poses["solved"]).assign_attrs(
         configuration_dims=configuration)
-
-
-def require_draws(results: xr.Dataset, kept: Sequence[str]) -> None:
-    """Raise unless there are draws to make intervals of."""
-    if DRAWS in kept:
-        raise ArgumentError("per", DRAWS, "intervals are over the draws; they cannot be kept")
-    if results.sizes.get(DRAWS, 1) < 2:
-        raise DatasetError(
-            "trial: this store has a single draw of each pose, so that nothing tells how far its "
-            "numbers are chance; give the pipeline something drawn (jitter_px = 0.5, noise_grey) "
-            "and trial = 100 under [axes], and run it again")
 
 
 def _judged(
@@ -574,7 +562,7 @@ def _judged(
 MAX_DRAWS = 1e9
 
 #: Numbers of draws of which the first that decides a rate is taken.
-POWERS = np.unique(np.ceil(1.1 ** np.arange(1, 218))).tolist()
+POWERS = np.unique(np.ceil(1.1 ** np.arange(1, 218)))
 
 
 def draws_needed(
@@ -641,17 +629,11 @@ def _needed(
 
 def _of_rate(rate: float, limit: float, level: float) -> float:
     """Return the least power of about 1.1 at which the interval excludes the limit."""
-    if rate == limit:
-        return math.inf
-
-    def is_decided(n: float) -> bool:
-        # Whole hits, rounded towards the limit.
-        hits = math.floor(rate * n) if rate > limit else math.ceil(rate * n)
-        low, high = estimator.clopper_pearson(hits, n, level)
-        return bool(low > limit) if rate > limit else bool(high < limit)
-
-    first = bisect.bisect_left(POWERS, True, key=is_decided)
-    return _rounded(POWERS[first]) if first < len(POWERS) else math.inf
+    # Whole hits, rounded towards the limit.
+    hits = np.floor(rate * POWERS) if rate > limit else np.ceil(rate * POWERS)
+    low, high = estimator.clopper_pearson(hits, POWERS, level)
+    decided = POWERS[low > limit if rate > limit else high < limit]
+    return _rounded(decided[0]) if decided.size else math.inf
 
 
 def _rounded(count: float) -> float:
@@ -1669,7 +1651,4 @@ def precision_reached(
     return out.assign(settled=settled, run=poses["run"], poses=poses["poses"]).assign_coords(
         quantity=("quantity", [each.what.name for each in precisions]),
         wanted=("quantity", [each.half_width for each in precisions]),
-        # The quantity of which the half-width is a share; none of a rate.
-        relative_to=("quantity", ["" if each.what.is_rate else "RMSE" if each.spread else "value"
-                                  for each in precisions]),
     ).assign_attrs(configuration_dims=configuration)

@@ -16,7 +16,7 @@ from scipy import special, stats
 
 from sweep.analysis import dataset, estimator
 from sweep.analysis.dataset import DRAWS, QUANTITIES, Poses, Quantity, as_names, describes, stacked
-from sweep.analysis.estimator import INTERVAL, LEVEL, Bins, Count, Mean, Rate, Statistic, aggregate
+from sweep.analysis.estimator import INTERVAL, LEVEL, Bins, Count, Mean, Rate, Statistic
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import POSE_PARAMETERS, cf_attributes
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, flag, outcomes
@@ -235,14 +235,13 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
         - ``p_value`` of the ID against the others, stratified by cell; ``p_adjusted`` is corrected
           for all comparisons in the table.
         - ``weak``: below its expected rate with ``p_adjusted`` below 0.05.
-        - ``rank``: 1 has the lowest share of its expected rate.
 
     Raises
     ------
     ArgumentError
-        If ``per`` names trials, or a dimension that does not exist.
+        If ``per`` names trials or a dimension that does not exist, or ``marker_id`` is none.
     DatasetError
-        If the dataset has no dimension ``marker_id``, lacks variables of results, or has no poses.
+        If the dataset lacks variables of results, or has no poses.
 
     Notes
     -----
@@ -261,8 +260,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     >>> table["detection_rate"].round(3).values.tolist(), table["weak"].values.tolist()
     ([0.542, 0.542], [False, False])
     """
-    dataset.require_dimension(results, "marker_id")
-    own = [name for name in ("dictionary", "marker_id") if name in dataset.axes_of(results)]
+    own = [*{"dictionary"}.intersection(dataset.axes_of(results)), "marker_id"]
     kept = dataset.kept_dimensions(
         results, (*(name for name in as_names(per) if name != "marker_id"), *own))
     if DRAWS in kept:
@@ -273,8 +271,8 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     if dataset.is_sampling_stopped(results):
         inputs[dataset.COMMON] = dataset.common_trials(results, inputs, kept)
     rate = replace(DETECTION_RATE, counts=(LOOKED_FOR, ("detected", "")))
-    table, counts = (aggregate(results, inputs, names, [rate], Poses)
-                     for names in (kept, (*kept, *cells)))
+    (table,), (counts,) = (estimator.aggregates(results, inputs, names, [[rate]], Poses)
+                           for names in (kept, (*kept, *cells)))
     table = table.drop_vars(["detected", "draws"])
     n = counts["draws"].astype(np.float64)
     hits = (counts["detected"] * n / counts["looked_for"]).where(n > 0, 0.0)
@@ -288,10 +286,6 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     p_value = xr.apply_ufunc(two_sided, hits - expected, variance, third).where(drawn)
     adjusted = xr.apply_ufunc(holm, p_value)
     expected_rate = expected / n
-    share = table["detection_rate"] / expected_rate
-    rank = xr.apply_ufunc(  # equal values share the lowest
-        stats.rankdata, share, kwargs={"method": "min", "axis": -1, "nan_policy": "omit"},
-        input_core_dims=[["marker_id"]], output_core_dims=[["marker_id"]]).astype(np.float64)
     below = table["detection_rate"] < expected_rate
     return table.assign({name: array.assign_attrs(long_name=meaning, units="1")
                          for name, array, meaning in (
@@ -299,8 +293,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
         ("p_value", p_value, "chance of a rate so far from it if they were alike"),
         ("p_adjusted", adjusted, "the same for the whole table (Holm)"),
         ("weak", below & (adjusted < SIGNIFICANCE),
-         "whether the rate is below the expected one, p_adjusted < 0.05"),
-        ("rank", rank, "1 has the lowest share of its expected rate"))})
+         "whether the rate is below the expected one, p_adjusted < 0.05"))})
 
 
 def hypergeometric_moments(
@@ -509,7 +502,8 @@ def _table(
     """Return some statistics, (*per, *bins)."""
     kept = dataset.kept_dimensions(results, per)
     inputs = dataset.pose_arrays(results, [name for each in statistics for name in each.inputs])
-    return aggregate(results, inputs, kept, statistics, Poses, bins)
+    table, = estimator.aggregates(results, inputs, kept, [statistics], Poses, bins)
+    return table
 
 
 # --------------------------------------------------------------------------------------------------

@@ -248,8 +248,8 @@ def test_a_model_answers_only_in_the_joint_region_that_was_seen(name, regions):
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    (lambda d: d.isel(trial=[0]), "trial has 1 value: an error model is fitted to some"),
-    (lambda d: d.isel(trial=slice(0, None, 2)), "trial has no even or no odd values"),
+    (lambda d: d.isel(trial=[0]), "trial: this store has a single draw of each pose"),
+    (lambda d: d.isel(trial=slice(0, None, 2)), "0 solved poses that are not flipped"),
     (lambda d: d.isel(trial=slice(0, 4)), "80 solved poses that are not flipped; an error model"),
     (lambda d: d.assign(detection=0 * d.detection), "no pose was looked for"),
     (lambda d: d.assign_attrs(pipeline="").drop_attrs(), "not a coordinate, and the attributes"),

@@ -46,12 +46,13 @@ ODD = {
 
 def trial_pipeline(
     kind: str, name: str, dictionary: str, settings: Sequence[str], folder: str,
-    of_boards: bool = False, count: int = SCENES, noise_grey: float = 0.0,
+    of_boards: bool = False, count: int = SCENES,
 ) -> Pipeline:
     """Return the pipeline of ``count`` scenes and one setting of a detector, or of a solver.
 
     Scene i + count/2 is scene i turned by 180° about the image's centre, exactly. Behind them are
-    count/2 scenes that are seen nearly from the side, and the frames of :data:`ODD`.
+    count/2 scenes that are seen nearly from the side, and the frames of :data:`ODD`. What settings
+    give is the same in all of them.
 
     Raises
     ------
@@ -60,20 +61,20 @@ def trial_pipeline(
     """
     rng, half = np.random.default_rng(20), count // 2
     drawn = pd.DataFrame({name: rng.uniform(*ends, half) for name, ends in RANGES.items()})
-    drawn["side_px"] = np.geomspace(60.0, 150.0, half).round(2)
+    drawn = drawn.assign(width_px=640, height_px=480, side_px=np.geomspace(60, 150, half).round(2))
     if not of_boards and dictionary in dictionary_names():  # an unknown one is refused below
         drawn["marker_id"] = rng.integers(marker_count(dictionary), size=half)
-    drawn = drawn.assign(width_px=640, height_px=480, noise_grey=noise_grey)
     reflected = drawn.copy()
     reflected[["azimuth_deg", "roll_deg"]] += 180
     reflected[["bearing_x_deg", "bearing_y_deg"]] *= -1
     steep = drawn.assign(tilt_deg=rng.uniform(80.0, 85.0, half))
     scenes = pd.concat([drawn, reflected, steep, pd.DataFrame(ODD)]).fillna(0).round(6)
+    scenes = scenes.drop(columns=[each.partition("=")[0] for each in settings], errors="ignore")
     document: dict[str, Any] = {
         "title": "Conformance", "camera": {"fx_px": 600.0, "fy_px": 600.0},
         "marker": {"dictionary": dictionary}, "scene": {"window": "full"},
         "detector": {"detector": name},
-        "axes": {"trial_scene": {"zip": scenes.convert_dtypes().to_dict("list")}},
+        "axes": {"trial_scene": {"zip": scenes.drop_duplicates().convert_dtypes().to_dict("list")}},
     }
     if kind == "estimator":
         document["detector"] = {"detector": OPENCV, "cornerRefinementMethod": "subpix"}
@@ -122,7 +123,7 @@ def answers_to(pipeline: Pipeline, kind: str, numbers: Sequence[int]) -> list[An
     batch, failures = scenes_at(pipeline.experiment, [np.array(numbers)]), list[Failure]()
     (found,), _ = detections_of(batch, batch.visible[:, None], failures, keep=True)
     if failures:
-        raise PluginError(failures[0].text.strip().rpartition("PluginError: ")[2])
+        raise PluginError(failures[0].text.strip().rpartition("\n")[2].split(": ", 1)[-1])
     answers: list[Answer] = [()] * len(numbers)
     if kind == "detector":
         for row, output in found.outputs.items():
@@ -132,11 +133,10 @@ def answers_to(pipeline: Pipeline, kind: str, numbers: Sequence[int]) -> list[An
         return answers
     (setting,), rows = batch.experiment.estimators, np.flatnonzero(
         found.flags == DetectionStatus.detected)
-    if len(rows):
-        estimates = build(setting)(detections_for(setting, batch, found, rows))
-        columns = [getattr(estimates, each.name) for each in dataclasses.fields(Estimates)]
-        for row, estimate in zip(rows.tolist(), zip(*columns, strict=True), strict=True):
-            answers[row] = estimate if estimate[0] == EstimateStatus.solved else ()
+    estimates = build(setting)(detections_for(setting, batch, found, rows))
+    columns = [getattr(estimates, each.name) for each in dataclasses.fields(Estimates)]
+    for row, estimate in zip(rows.tolist(), zip(*columns, strict=True), strict=True):
+        answers[row] = estimate if estimate[0] == EstimateStatus.solved else ()
     return answers
 
 
@@ -265,12 +265,11 @@ def findings_of(kind: str, pipeline: Pipeline) -> Iterator[Finding]:
     yield same([every], "again")
 
     told = dict[str, None]()
-    columns = pipeline.axes[0].columns
-    sizes = zip(columns["width_px"], columns["height_px"], strict=True)
-    for number, (width, height) in [*enumerate(sizes)][SCENES:]:
+    for number in range(SCENES, len(pipeline.axes[0])):
         try:
             answers([number])
         except PluginError as error:
+            width, height = scenes_at(pipeline.experiment, [np.array([number])]).scenes.frame[0]
             told[f"a frame of {width} x {height} px: {error}"] = None
     yield same([every[::-1], *([row] for row in every)], "in reverse order, alone, after odd input")
 

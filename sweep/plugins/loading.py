@@ -8,6 +8,7 @@ import hashlib
 import importlib.metadata
 import io
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -51,13 +52,15 @@ def _its_faults(begin: str = "a plug-in that can be imported:", path: str = "") 
     """Raise PluginError for whatever is raised, also for an attempt to exit: one line.
 
     The line begins with a text and ends, for a plug-in in a file, with its line of the file. If
-    memory runs out, or the user interrupts, that is raised.
+    memory runs out, or the user interrupts, that is raised. Workers ignore interrupts: there a
+    plug-in raised it itself.
     """
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     try:
         yield
-    except (MemoryError, KeyboardInterrupt):
-        raise
     except BaseException as error:
+        if isinstance(error, (MemoryError,) if ignored else (MemoryError, KeyboardInterrupt)):
+            raise
         lines = [line for file, line, *_ in traceback.extract_tb(error.__traceback__)
                  if file == path]
         where = f" (line {lines[-1]} of {Path(path).name})" if lines else ""

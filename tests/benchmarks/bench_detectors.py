@@ -42,7 +42,7 @@ def searched(name, scenes, noise):
     cv2.setNumThreads(1)
     detector, dictionary, chosen = METHODS[name]
     pipeline = trial_pipeline(
-        "detector", detector, dictionary, chosen, ".", count=scenes, noise_grey=noise)
+        "detector", detector, dictionary, (*chosen, f"noise_grey={noise}"), ".", count=scenes)
     rows, frame = np.arange(scenes), np.tile([0, 0, 640, 480], (scenes, 1))
     batch = scenes_at(pipeline.experiment, [rows])
     shown, images = batch.scenes, render_all(batch.scenes, rows, batch.boxes, frame)

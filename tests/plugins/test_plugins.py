@@ -5,9 +5,11 @@ Those at fault are told in a line each, and what others computed is not lost.
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -27,6 +29,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.crash_isolation import check_plugins, use
 from sweep.measure.detectors import full_frame_reason
 from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.plugins.loading import call
 from sweep.store.lifecycle import open_store
 from sweep.store.provenance import differences, fingerprint
 from sweep.tradeoff.costs import clock_of
@@ -315,6 +318,18 @@ def test_an_image_at_which_a_detector_is_at_fault_is_flagged(bad, returned, told
     (failure,) = cells.failures
     assert (failure.stage, failure.setting) == ("detection", 1)
     assert f"PluginError: bad:D: {told}" in failure.text.splitlines()[-1]
+
+
+def test_an_interrupt_that_a_plug_in_raises_itself_is_its_fault_in_a_worker():
+    interrupted = mock.Mock(side_effect=KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt):  # as the user's
+        call("bad:interrupted", interrupted)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as workers are
+    try:
+        with pytest.raises(PluginError, match="raises KeyboardInterrupt"):
+            call("bad:interrupted", interrupted)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize(("made", "told"), [

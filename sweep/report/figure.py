@@ -269,7 +269,8 @@ class Panel:
             axes.tick_params(axis="y", length=0)
         else:
             x = np.unique(np.concatenate([line.at for line in self.lines]))
-            set_ends(axes, "x", x, margin=0.05, logarithmic=is_logarithmic(x) and x[0] > 0)
+            factors = is_logarithmic(x) and x[0] > 0 and not self.place.endswith(", deg")
+            set_ends(axes, "x", x, margin=0.05, logarithmic=factors)
             axes.set_xlabel(self.place)
             if 0 < x.size <= MAX_OWN_TICKS and not any(line.texts for line in self.lines):
                 axes.set_xticks(x, coordinates(x.tolist()))

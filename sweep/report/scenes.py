@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
-from sweep.evaluation.results import compare
 from sweep.experiment.pipeline import cell, coordinates_text, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, uncounted_values
@@ -49,28 +48,35 @@ MAX_INCHES, MIN_DPI = 10, 100
 
 MAX_ENLARGEMENT = 24
 
+#: Part of the marker's side that is shown around it, and pixels that a part of an image has.
+MARGIN, MIN_SIDE = 0.35, 4
+
 #: Characters of a caption's line, and entries of its legend side by side.
 CHARS_AN_INCH, MIN_CHARS, COLUMNS = 11, 60, 4
 
 
-def scene_png(scene: SceneInspection, title: str = "") -> bytes:
+def scene_png(scene: SceneInspection, title: str = "", *, close: bool = False) -> bytes:
     """Return a scene enlarged as a PNG.
 
     Parameters
     ----------
     scene
         Image, truth and detections.
+    close
+        Whether the part of the image around the marker is shown, where it is seen.
     title
         First line of a caption below it: the pose on its grid. Then come what was drawn at random,
         flags and errors, and the legend.
     """
-    height, width = scene.image.shape
+    left, top, right, bottom = around_marker(scene) if close else scene.window
+    height, width = bottom - top, right - left
     scale = max(1, min(MAX_SIDE // max(height, width), MAX_ENLARGEMENT))
     dpi = max(MIN_DPI, scale * width / MAX_INCHES)
     canvas = Canvas((scale * width / dpi, scale * height / dpi), dpi=dpi)
     axes = canvas.add_axes((0, 0, 1, 1))
     axes.set_axis_off()
     _draw(axes, scene)
+    axes.set(xlim=(left - 0.5, right - 0.5), ylim=(bottom - 0.5, top - 0.5))
     if title:
         drawn = ", ".join(
             f"{name} {float(value):.5g}" for name, value in scene.values.items()
@@ -119,7 +125,17 @@ def _draw(axes: Axes, scene: SceneInspection) -> None:
     if np.isfinite(scene.axes_px).all():
         for (label, colour), end in zip(AXES.items(), scene.axes_px[1:], strict=True):
             axes.plot(*np.stack([scene.axes_px[0], end]).T, color=colour, linewidth=2, label=label)
-    axes.set(xlim=extent[:2], ylim=extent[2:])
+
+
+def around_marker(scene: SceneInspection) -> tuple[int, ...]:
+    """Return the part of a scene's window around the marker; all of it if too little is seen."""
+    low, high = scene.true_corners.min(axis=0), scene.true_corners.max(axis=0)
+    margin = max(MIN_SIDE, MARGIN * (high - low).max())
+    left_top = np.maximum(low - margin, scene.window[:2])
+    right_bottom = np.minimum(high + margin, scene.window[2:])
+    if not (right_bottom - left_top >= MIN_SIDE).all():  # nor if a corner is NaN
+        return scene.window
+    return tuple(np.round([*left_top, *right_bottom]).astype(int).tolist())
 
 
 # --------------------------------------------------------------------------------------------------
@@ -133,12 +149,10 @@ def value_table(
     rows = []
     for variable in variables:
         value, beside = recomputed[variable.name], ""
-        text = _value_text(variable, value)
-        if stored is not None and variable.name in stored:
-            other = stored[variable.name]
-            if not np.array_equal(value, other, equal_nan=variable.flags is None):
-                beside = _value_text(variable, other)
-                beside = "other last digits" if beside == text else beside
+        text, other = _value_text(variable, value), (stored or {}).get(variable.name)
+        if other is not None and not np.array_equal(value, other, equal_nan=variable.flags is None):
+            beside = _value_text(variable, other)
+            beside = "other last digits" if beside == text else beside
         rows.append([variable.name, text, variable.units, beside])
     return Table.of("Values of the cell", ["variable", "value", "unit", "stored"], rows, words=True)
 
@@ -203,7 +217,7 @@ def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
 
 
 # --------------------------------------------------------------------------------------------------
-# Example scenes of a store, rendered and searched again, and compared with the stored values.
+# Example scenes of a store, rendered and searched again.
 
 class Scene(NamedTuple):
     """One scene of the gallery.
@@ -217,7 +231,7 @@ class Scene(NamedTuple):
     command
         Command line that draws it.
     result
-        Flags and errors, as text; and how they differ from the stored ones.
+        Flags and errors, as text.
     picture
         A PNG; None if ``result`` says why there is none.
     """
@@ -238,29 +252,21 @@ def scenes_of(data: ReportData) -> list[Scene]:
 
 
 def _scene(data: ReportData, index: Index, titles: Sequence[str]) -> Scene:
-    variables = data.pipeline.experiment.variables
-    single_cell = data.results.isel(index)
-    stored = {each.name: np.asarray(single_cell[each.name].values) for each in variables
-              if each.name in single_cell}
+    flags = data.results.isel(index)
     at = selection_text(data.pipeline, index)
     command = quoted("sweep", "show", f"{data.pipeline.name}.toml", *(["--at", at] if at else []))
     shown = Scene(titles, at.replace(",", ", "), command, "", None)
-    if "crashed" in (DetectionStatus(int(stored["detection"])).name,
-                     EstimateStatus(int(stored["estimate"])).name):
+    if flags["detection"] == DetectionStatus.crashed or flags["estimate"] == EstimateStatus.crashed:
         return shown._replace(result="crashed: not drawn, its process died; `sweep repro` computes "
                               "it in a process of its own.")
     try:
         single = cell(data.pipeline, at)
         inspected = inspect_scene(single)
-        picture = scene_png(inspected)  # the page has a caption of its own
+        picture = scene_png(inspected, close=True)  # the page has a caption of its own
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
         return shown._replace(result=f"Cannot be drawn on this machine: {exception_line(error)}")
-    # The store may be another machine's: as `sweep verify`, within the tolerances for those.
-    difference = compare(inspected.values, stored, variables, same_processor=False)
-    return shown._replace(
-        coordinates=coordinates_text(data.pipeline, single), picture=picture,
-        result=result_text(inspected) + (
-            f"; differs from the store: {difference}" if difference else ""))
+    return shown._replace(coordinates=coordinates_text(data.pipeline, single), picture=picture,
+                          result=result_text(inspected))
 
 
 def result_text(scene: SceneInspection) -> str:

@@ -129,8 +129,7 @@ class Bin(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        return "\u2013".join(
-            f"{end:.3g}" if abs(end) < 1000 else f"{end:.0f}" for end in self)
+        return "\u2013".join(f"{end:.3g}" if abs(end) < 1000 else f"{end:.0f}" for end in self)
 
     @property
     def middle(self) -> float:

@@ -12,7 +12,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from sweep import analysis
@@ -24,7 +23,7 @@ from sweep.analysis.summaries import ThresholdChoice
 from sweep.errors import ArgumentError, DatasetError, StoreError, path_of
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import BoundStatus, Flag, outcomes, present_values
-from sweep.messages import byte_count, quoted
+from sweep.messages import quoted
 from sweep.report import findings, output_file, report_data
 from sweep.report import table as tables
 from sweep.report.figure import MAX_DOTS, MAX_LINES, Figure, panels_file
@@ -307,8 +306,10 @@ def precision_table(data: ReportData) -> Table:
 
 def in_words(flags: xr.DataArray, kind: type[Flag]) -> xr.DataArray:
     """Return flags as words."""
-    words = {int(flag): flag.name.replace("_", " ") for flag in kind}
-    return flags.copy(data=np.vectorize(words.__getitem__, otypes=[object])(flags.values))
+    words: xr.DataArray = xr.apply_ufunc(
+        lambda flag: kind(flag).name.replace("_", " "), flags, vectorize=True,
+        output_dtypes=[object])
+    return words
 
 
 # --------------------------------------------------------------------------------------------------
@@ -588,7 +589,6 @@ def write_report(
                 write_whole(folder / name, content)
     # Invalid Unicode, which a file's name may hold, is written as a question mark.
     output_file.write_output_file(file, text.encode("utf-8", errors="replace"))
-    size = f", {byte_count(file.stat().st_size)}" if file.is_file() else ""
     then = (f"look at {file}", "")
     if data.trade is None and data.setting_axes:
         then = (f"sweep tradeoff {quoted(data.store)}", "what each configuration costs")
@@ -597,7 +597,7 @@ def write_report(
         "required": list(data.require), "per": list(data.per)}
     # Into the page's own stream a line more would not be HTML.
     lines = [] if output_file.standard_stream(file) else [
-        f"{file}: {tables.plural(len(drawn), 'figure')}{size}", *data.warnings, found.headline]
+        f"{file}: {tables.plural(len(drawn), 'figure')}", *data.warnings, found.headline]
     return Findings(lines, numbers | found.as_json(), None, 0, then if lines else ("", ""))
 
 

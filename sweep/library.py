@@ -12,22 +12,20 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sweep import compilation, processor
+    from sweep import processor
     from sweep.analysis import camera_calibration, requirements
     from sweep.conformance import check
     from sweep.diagnosis import diagnosis, observations
     from sweep.evaluation import block, inspection
     from sweep.exchange import answers, export, score
     from sweep.execution import forecast, progress, runner, status
-    from sweep.experiment import parameters, pipeline, sampling
-    from sweep.fitting import fit
+    from sweep.experiment import parameters, pipeline
     from sweep.integrity import verification
     from sweep.photographs import prepare
     from sweep.plugins import loading
     from sweep.report import figure, findings, output_file, report_data, scenes, table
     from sweep.sampling import rules
-    from sweep.store import lifecycle, locations, lock
-    from sweep.tradeoff import choice_search
+    from sweep.store import lifecycle, locations
 
 if not TYPE_CHECKING:  # so that mypy knows the names above alone
 

@@ -637,8 +637,6 @@ def _is_axis(value: Any, parameter: Parameter) -> bool:
 # --------------------------------------------------------------------------------------------------
 # The pipeline: a document that is checked as a whole.
 
-MAX_SHOWN_PATH_LENGTH = 400
-
 
 @dataclass(frozen=True)
 class Pipeline(Grid):
@@ -725,7 +723,7 @@ class Pipeline(Grid):
             One line for each fault of the file or of the settings.
         """
         path = Path(path_of("path", path))
-        source = plain(path, MAX_SHOWN_PATH_LENGTH)
+        source = plain(path, 400)
         with documents.refusing(source):
             text = documents.file_text(path)
         return Pipeline.from_text(

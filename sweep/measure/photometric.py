@@ -8,19 +8,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sweep.measure import likelihood
+from sweep.measure import likelihood, solver
 from sweep.measure.estimation import Detections, Estimates, covariance_elsewhere, pose_covariance
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import BLACK, DEPTH, POSITION, WHITE
 from sweep.measure.photograph import SIZE, locate_photograph, photograph_view, pixel_count
-from sweep.measure.solver import (
-    MIN_POINTS,
-    GuardedPoints,
-    Pose,
-    both_planar_solutions,
-    poses_of_each_marker,
-    reprojection_px,
-)
 from sweep.model.board import box_corners, extent_of, own_sheets, sheets_m, unit_m
 from sweep.model.coverage import POSE
 from sweep.model.marker import module_count
@@ -37,7 +29,8 @@ def marker_poses(detections: Detections, *, refined: bool) -> tuple[Floats, Floa
     """
     found = [detections.corners, *([refined_corners(detections)] if refined else [])]
     solved = [
-        both_planar_solutions(corners, detections.cameras, detections.size_m) for corners in found
+        solver.both_planar_solutions(quads, detections.cameras, detections.size_m)
+        for quads in found
     ]
     rotations, translations = zip(*solved, strict=True)
     return np.concatenate(rotations, axis=1), np.concatenate(translations, axis=1)
@@ -49,24 +42,24 @@ def board_poses(one: Detections, *, refined: bool) -> tuple[Floats, Floats]:
     Rotations (K, 3, 3) and translations (K, 3). The poses from the corners of all markers, and that
     of the marker on which most of the others agree: one marker that is wrong spoils the former.
     """
-    poses: list[Pose] = []
+    poses: list[solver.Pose] = []
     points = one.objects_m.reshape(-1, 3)
     for corners in (one.corners, refined_corners(one)) if refined else (one.corners,):
         pixels = corners.reshape(-1, 2)
-        guard = GuardedPoints.of(points, pixels, one.cameras)
+        guard = solver.GuardedPoints.of(points, pixels, one.cameras)
         poses += guard.poses(cv2.SOLVEPNP_IPPE) + guard.poses(cv2.SOLVEPNP_ITERATIVE)
         if len(corners) > 1:
-            each = poses_of_each_marker(points, pixels, one.cameras)
+            each = solver.poses_of_each_marker(points, pixels, one.cameras)
             away = [_typical_error_px(pose, one, corners) for pose in each]
             poses += [each[k] for k in np.argsort(away)[:1].tolist() if math.isfinite(away[k])]
     rotations, translations = zip(*poses, strict=True) if poses else ((), ())
     return np.reshape(rotations, (-1, 3, 3)), np.reshape(translations, (-1, 3))
 
 
-def _typical_error_px(pose: Pose, one: Detections, corners: Floats) -> float:
+def _typical_error_px(pose: solver.Pose, one: Detections, corners: Floats) -> float:
     """Return the median of the markers' reprojection errors; NaN becomes infinite."""
     errors = [
-        reprojection_px(*pose, objects, pixels, one.cameras)
+        solver.reprojection_px(*pose, objects, pixels, one.cameras)
         for objects, pixels in zip(one.objects_m, corners, strict=True)
     ]
     return float(np.median(np.nan_to_num(errors, nan=math.inf)))
@@ -188,7 +181,7 @@ class Photometric:
             planar = marker_poses(detections, refined=self.refined)
         points = 4 * np.bincount(detections.owner, minlength=len(detections))
         for i in range(len(detections)):
-            if points[i] < MIN_POINTS:
+            if points[i] < solver.MIN_POINTS:
                 out.status[i] = EstimateStatus.too_few_points
                 continue
             poses = (
@@ -238,7 +231,7 @@ class Photometric:
         information = np.empty((free, free))
         target = detections.targets[row]
 
-        def seen_from(pose: Pose) -> likelihood.MarkerView:
+        def seen_from(pose: solver.Pose) -> likelihood.MarkerView:
             return likelihood.marker_view(
                 target, first_side_m(detections, row), detections.cameras.optics(row),
                 detections.origins[row] + np.array([left, top]),

@@ -28,15 +28,7 @@ from sweep.plugins.loading import is_recording, printing_to_stderr
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line, write_groups
 from sweep.store.lock import changing
 from sweep.store.provenance import differences
-from sweep.tradeoff.costs import (
-    Indices,
-    any_process_interval,
-    measure,
-    measure_renderers,
-    median_interval,
-    sample_scenes,
-    whole_frames_of,
-)
+from sweep.tradeoff import costs
 from sweep.tradeoff.pareto import WRONG, WRONG_BELIEF, configuration_label
 from sweep.typing import Floats
 
@@ -163,38 +155,39 @@ def _trade(
     report(measuring, 0.0)
     samples = [
         _without_crashed(pipeline, results, [
-            sample_scenes(pipeline, dict(zip(per, condition, strict=True)), len(conditions))
+            costs.sample_scenes(pipeline, dict(zip(per, condition, strict=True)), len(conditions))
         ])[0]
         for condition in conditions
     ]
-    costs = measure(
+    timed = costs.measure(
         pipeline, samples, max(deadline - time.perf_counter(), MIN_SHARE * limit_s), interrupts,
         lambda share: report(measuring, share),
     )
-    detection = np.broadcast_to(costs.detection[..., None], costs.total.shape)
+    detection = np.broadcast_to(timed.detection[..., None], timed.total.shape)
     for name, meaning, unit, interval in (
         ("cost_ms", "detection and estimation of a frame", "ms",
-         median_interval(1e3 * costs.total)),
-        ("cost_ratio", "cost over the baseline's", "1", any_process_interval(costs.ratio)),
-        ("detection_ms", "detection of a frame", "ms", median_interval(1e3 * detection)),
-        ("estimation_ms", "estimation of a frame", "ms", median_interval(1e3 * costs.estimation)),
+         costs.median_interval(1e3 * timed.total)),
+        ("cost_ratio", "cost over the baseline's", "1", costs.any_process_interval(timed.ratio)),
+        ("detection_ms", "detection of a frame", "ms", costs.median_interval(1e3 * detection)),
+        ("estimation_ms", "estimation of a frame", "ms",
+         costs.median_interval(1e3 * timed.estimation)),
     ):
         _add(trade, (*per, "treatment"), name, meaning, unit, interval)
-    whole = whole_frames_of(pipeline)
+    whole = costs.whole_frames_of(pipeline)
     return trade.isel(treatment=distinct(pipeline, settings)).assign_attrs({
         "title": pipeline.heading,
         "poses": int(computed_scenes(results).sum()),
         "window": "full" if all(whole) else "auto" if not any(whole) else "mixed",
         "baseline": str(trade["treatment"].values[0]),
-        "rounds": len(costs.total),
-        "frames": int(np.nansum(costs.frames)),
+        "rounds": len(timed.total),
+        "frames": int(np.nansum(timed.frames)),
         "sampled": sum(len(sample[0]) if sample else 1 for sample in samples),
     })
 
 
 def _without_crashed(
-    pipeline: Pipeline, results: xr.Dataset, samples: Sequence[Sequence[Indices]]
-) -> list[list[Indices]]:
+    pipeline: Pipeline, results: xr.Dataset, samples: Sequence[Sequence[costs.Indices]]
+) -> list[list[costs.Indices]]:
     """Return samples without the scenes that crashed their process in the run.
 
     Samples are paired: a scene that is left out of one is left out of all.
@@ -254,15 +247,16 @@ def _renderers(
 ) -> xr.Dataset:
     """Return the cost of each renderer, and what it changes against exact images."""
     samples = _without_crashed(pipeline, results, [
-        sample_scenes(pipeline, {"renderer": number}, len(names)) for number in range(len(names))
+        costs.sample_scenes(pipeline, {"renderer": k}, len(names)) for k in range(len(names))
     ])
     reference = names.index(REFERENCE)
-    seconds, rms, largest = measure_renderers(pipeline, samples, reference, limit_s, interrupts)
+    seconds, rms, largest = costs.measure_renderers(
+        pipeline, samples, reference, limit_s, interrupts)
     changed = renderer_bias(results, REFERENCE)
     _add(changed, ("renderer",), "render_ms", "rendering of an image", "ms",
-         median_interval(1e3 * seconds))
+         costs.median_interval(1e3 * seconds))
     _add(changed, ("renderer",), "render_ratio", "cost over that of exact", "1",
-         any_process_interval(seconds / seconds[:, [reference]]))
+         costs.any_process_interval(seconds / seconds[:, [reference]]))
     for name, meaning, values in (
         ("grey_rms", "RMS difference of the marker's pixels from the exact image's", rms),
         ("grey_max", "largest difference from the exact image", largest),

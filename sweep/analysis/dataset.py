@@ -883,29 +883,18 @@ def chosen_quantities(names: Iterable[str] | None) -> list[Quantity]:
 
 
 # --------------------------------------------------------------------------------------------------
-# Attributes of tables for readers: short names, and the rule by which sampling was stopped.
+# Words for readers: short names of tables, and the rule by which sampling was stopped.
 
 P = ParamSpec("P")
 
-#: The attribute of tables of datasets whose sampling was stopped.
-SAMPLING = "sampling"
-
 
 def describes(analysis: Callable[P, xr.Dataset]) -> Callable[P, xr.Dataset]:
-    """Return an analysis whose result has short names, and says whether sampling was stopped."""
+    """Return an analysis whose result has short names."""
     @functools.wraps(analysis)
     def described(*args: P.args, **kwargs: P.kwargs) -> xr.Dataset:
-        table = with_descriptions(analysis(*args, **kwargs))
-        return with_sampling(table, *(
-            each for each in (*args, *kwargs.values()) if isinstance(each, xr.Dataset)))
+        return with_descriptions(analysis(*args, **kwargs))
 
     return described
-
-
-def with_sampling(table: xr.Dataset, *datasets: xr.Dataset) -> xr.Dataset:
-    """Return a table with the attribute :data:`SAMPLING`, if sampling of a dataset was stopped."""
-    texts = dict.fromkeys(text for each in datasets if (text := sampling_text(each)))
-    return table.assign_attrs({SAMPLING: "; ".join(texts)}) if texts else table
 
 
 def sampling_text(results: xr.Dataset) -> str:

@@ -725,10 +725,10 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
                 (f"{cell}_high", cell, edges[1:], "high end of cells")):
             coordinates[coordinate] = dim, condition.unscaled(values), {
                 "units": condition.units, "long_name": f"{words} of {condition.words}"}
-    return dataset.with_sampling(xr.Dataset(variables, coordinates, attrs={
+    return xr.Dataset(variables, coordinates, attrs={
         "focal_size_px_m": float(focal_size.mean()),
         "focal_size_varies": int(most > least * (1 + 1e-9)),
-    }), results)
+    })
 
 
 def _at_knots(

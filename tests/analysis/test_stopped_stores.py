@@ -12,10 +12,10 @@ from sweep.analysis import (
     detection_rate,
     error_statistics,
     failure_composition,
-    marker_ranking,
     precision_reached,
 )
 from sweep.analysis.comparisons import regressions
+from sweep.analysis.dataset import sampling_text
 from sweep.analysis.requirements import Reached
 from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
@@ -85,14 +85,13 @@ def test_what_is_pooled_is_pooled_over_the_trials_that_all_have(stopped, full):
     assert abs(plain - detection_rate(stopped).detection_rate) > 0.05  # the trap
 
 
-def test_tables_say_which_rule_stopped_the_sampling(stopped, full):
-    expected = "stopped by [search]: precision = {detection_rate = 0.08}, max_trials = 200"
-    for table in (detection_rate(stopped, ["side_px"]), error_statistics(stopped),
-                  precision_reached(stopped), compare(full, stopped), marker_ranking(
-                      stopped.expand_dims(marker_id=[1, 2]))):
-        assert table.attrs["sampling"] == expected
-    assert "sampling" not in detection_rate(full).attrs
-    # Cells in which nothing was looked for do not lessen the trials.
+def test_a_dataset_says_which_rule_stopped_its_sampling(stopped, full):
+    assert sampling_text(stopped) == (
+        "stopped by [search]: precision = {detection_rate = 0.08}, max_trials = 200")
+    assert not sampling_text(full)
+
+
+def test_cells_in_which_nothing_was_looked_for_do_not_lessen_the_trials(stopped):
     flags = stopped.detection.copy()
     flags[0, :50] = DetectionStatus.not_visible
     assert detection_rate(stopped.assign(detection=flags)).looked_for == 2 * 100

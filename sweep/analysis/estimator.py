@@ -133,7 +133,7 @@ def _with_exact_ends(
 # larger than one over their number (Bonferroni): by `looks_factor`. For rates that it suffices is
 # enumerated exactly (`pytest -m evidence tests/sampling/test_limit_search.py`).
 
-FIRST, EACH = 0.35, 0.65
+FIRST_LOOK, EACH_LOOK = 0.35, 0.65
 
 
 def looks_factor(count: int) -> float:
@@ -150,7 +150,7 @@ def looks_factor(count: int) -> float:
     >>> looks_factor(1), round(looks_factor(14), 1)
     (1.0, 9.4)
     """
-    return FIRST + EACH * count
+    return FIRST_LOOK + EACH_LOOK * count
 
 
 # --------------------------------------------------------------------------------------------------

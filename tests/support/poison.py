@@ -39,7 +39,7 @@ def poisoned(poisons, log):
 
 
 POISONED_FUNCTIONS = [(search, "images_of"), (search, "detection_sources"),
-                      (block, "detections_for"), (block, "all_or_each")]
+                      (block, "detections_for"), (block.results, "all_or_each")]
 
 
 @contextlib.contextmanager

@@ -74,7 +74,7 @@ def _cells(batch):
 def poison(block, search, poisons, log):
     """Put poison into the functions of the evaluation by which scenes of known number pass."""
     images_of, detection_sources = search.images_of, search.detection_sources
-    detections_for, all_or_each = block.detections_for, block.all_or_each
+    detections_for, all_or_each = block.detections_for, block.results.all_or_each
     here = threading.local()
 
     def act(stage, cells, **treatment):
@@ -118,7 +118,7 @@ def poison(block, search, poisons, log):
         return all_or_each(worked, numbers, note)
 
     search.images_of, search.detection_sources = images, sources
-    block.detections_for, block.all_or_each = seen, estimated
+    block.detections_for, block.results.all_or_each = seen, estimated
 
 
 class _Finder(importlib.abc.MetaPathFinder):

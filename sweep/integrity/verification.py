@@ -61,11 +61,8 @@ def current_pipeline(store: RunStore) -> tuple[Pipeline, list[str]]:
     PipelineError
         If it cannot be computed at all, for want of a file, say.
     """
-    stored = store.pipeline
-    pipeline = Pipeline.from_text(
-        stored.text, name=stored.name, source=store.url, folder=stored.folder,
-    )
-    return pipeline, differences(pipeline, stored, store.fingerprint)
+    pipeline = lifecycle.read_pipeline(store.pipeline)
+    return pipeline, differences(pipeline, store.pipeline, store.fingerprint)
 
 
 # --------------------------------------------------------------------------------------------------

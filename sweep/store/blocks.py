@@ -247,10 +247,8 @@ class Receipt:
             raise ValueError("missing")
         try:
             content = json.loads(files.unpacked(chunk)[8:])
-            failures = tuple(FailedCell(**failure) for failure in content["failures"])
-            return cls(**content | {
-                "processors": tuple(content["processors"]), "failures": failures,
-            })
+            failures = [FailedCell(**failure) for failure in content["failures"]]
+            return cls(**content | {"failures": failures})
         except (AttributeError, KeyError, TypeError, RuntimeError) as error:
             raise ValueError(f"no receipt: {error}") from None
 

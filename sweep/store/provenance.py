@@ -29,15 +29,14 @@ NUMBERS_VERSION = 5
 def builds() -> dict[str, str]:
     """Return which builds of libraries are loaded in this process, whatever their metadata say."""
     config: dict[str, Any] = {**np.show_config(mode="dicts")}
-    # Paths are other ones for each Python that NumPy was built for.
-    for dependency in config["Build Dependencies"].values():
-        for path in ("include directory", "lib directory", "pc file directory"):
-            dependency.pop(path, None)
-    # The processor's features have an entry of their own in each receipt.
-    config = {part: config.get(part) for part in ("Compilers", "Build Dependencies")}
+    # Directories are other ones for each Python that NumPy was built for. The processor's features
+    # have an entry of their own in each receipt.
+    parts = [config.get("Compilers"), *(
+        {key: value for key, value in each.items() if "directory" not in key}
+        for each in config["Build Dependencies"].values())]
     return {
         "opencv": f"{cv2.__version__} {_digest(cv2.getBuildInformation())}",
-        "numpy": f"{np.__version__} {_digest(json.dumps(config, sort_keys=True))}",
+        "numpy": f"{np.__version__} {_digest(json.dumps(parts))}",
         "numba": numba.__version__,
         "llvmlite": llvmlite.__version__,
     }

@@ -268,7 +268,7 @@ def test_numbers_beyond_the_tolerance_are_told_on_this_and_on_another_processor(
     ran = started(["-c", "from sweep.processor import processor; print(processor())"],
                   env=elsewhere, stdout=subprocess.PIPE, text=True)
     with ran as process:
-        assert (process.communicate()[0].strip(),) != receipt.processors
+        assert [process.communicate()[0].strip()] != receipt.processors
     for url, sound_there in ((sound, True), (copied, False)):
         told = json.loads(command("verify", url, "--sample", "40", "--json", env=elsewhere).stdout)
         assert told["sampled"] >= 8

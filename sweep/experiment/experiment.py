@@ -20,12 +20,7 @@ from sweep.experiment.parameters import NAMED_BY, PARAMETERS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
 from sweep.measure import detectors
-from sweep.measure.detectors import (
-    AnyDetectorSetting,
-    BoardDetectorSetting,
-    DetectorSetting,
-    PluginSetting,
-)
+from sweep.measure.detectors import AnyDetectorSetting, BoardDetectorSetting, PluginSetting
 from sweep.measure.estimators import SOLVERS, EstimatorSetting, PluggedEstimatorSetting
 from sweep.measure.likelihood import BoundSetting
 from sweep.messages import label
@@ -117,7 +112,7 @@ class Experiment:
     @cached_property
     def detectors(self) -> list[AnyDetectorSetting]:
         """The detector settings, in the order of the detection axes."""
-        return [own or _made(DetectorSetting, values)
+        return [own or _made(detectors.DetectorSetting, values)
                 for values, own in self._settings("detector")]
 
     @cached_property
@@ -308,7 +303,7 @@ def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
     {'solver': 'ippe'}
     """
     # Each setting that some detectors or solvers have and others lack, with its owner.
-    owned = [("detector", detectors.OPENCV, {*_names(DetectorSetting)})]
+    owned = [("detector", detectors.OPENCV, {*_names(detectors.DetectorSetting)})]
     owned += [("solver", name, {*solver.own, *["guarded"] * solver.guarded})
               for name, solver in SOLVERS.items()]
     owned += [(NAMED_BY[plugin.kind].name, plugin.name, {each.name for each in plugin.settings})

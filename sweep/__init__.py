@@ -253,17 +253,12 @@ def photos(
     >>> dict(shots.detection.sizes)  # photographs, and markers of the board
     {'trial': 3, 'marker_id': 10}
     """
-    home, name = library.prepare.record_home(store)
     prepared = library.prepare.prepare(
-        folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
-        name=name, overwrite=options.get("overwrite", False),
-    )
+        folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, store=store,
+        overwrite=options.get("overwrite", False))
     for line in prepared.lines:
         notice(line)
-    return run(
-        prepared.pipeline,
-        store=store or os.path.join(home, f"{prepared.pipeline.name}.zarr"),  # noqa: PTH118
-        progress=progress, **options)
+    return run(prepared.pipeline, store=prepared.store, progress=progress, **options)
 
 
 def twins(

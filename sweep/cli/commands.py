@@ -763,13 +763,11 @@ def photos(
         As for `run`.
     """
     cli.SESSION.stopped = "stopped before anything was computed"
-    home, name = library.prepare.record_home(store)
     prepared = library.prepare.prepare(
-        folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
-        name=name, overwrite=overwrite)
+        folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, store=store,
+        overwrite=overwrite)
     summary = cli.executed(
-        prepared.pipeline, store or str(Path(home) / f"{prepared.pipeline.name}.zarr"),
-        prepared.lines, workers, overwrite=overwrite)
+        prepared.pipeline, prepared.store, prepared.lines, workers, overwrite=overwrite)
     count = prepared.pipeline.size(library.parameters.Stage.detection)
     each = f" with {count} detector settings" if count > 1 else ""
     return cli.summarised(

@@ -55,12 +55,15 @@ class Prepared(NamedTuple):
         Photographs found, left out and converted, a line each.
     photographs, markers
         How many there are: markers whose pose is known.
+    store
+        Path or URL of the store in which the results belong.
     """
 
     pipeline: Pipeline
     lines: tuple[str, ...]
     photographs: int
     markers: int
+    store: str
 
 
 class Side(NamedTuple):
@@ -130,8 +133,8 @@ def prepare(
     poses: PathName | None = None,
     stereo: PathName | None = None,
     settings: Sequence[str] = (),
-    home: PathName = "runs",
-    name: str = "",
+    store: PathName | None = None,
+    home: PathName | None = None,
     overwrite: bool = False,
     one_camera: bool = False,
 ) -> Prepared:
@@ -150,8 +153,11 @@ def prepare(
         there are; without one, ``settings`` give dictionary and size_m.
     settings
         "key=value" for the pipeline, as ``--set`` takes them.
-    home, name
-        Folder and name of the record (default: the first folder's name).
+    store
+        Of the results, whose name the record has (default: ``runs/NAME.zarr`` with the first
+        folder's name).
+    home
+        Folder of the record (default: beside the store, as :func:`record_home` says).
     overwrite
         Whether another record of that name is replaced.
     one_camera
@@ -172,7 +178,8 @@ def prepare(
     lines = list(dict.fromkeys(line for shots in found for line in shots.lines))
     if stereo is not None:
         _check_pairs(found[0], found[1])
-    first, place = found[0], Path(home)
+    beside, name = record_home(store)
+    first, place = found[0], Path(home or beside)
     dictionary, sizes, seen = _detected(target, document, str(board), settings, found)
     corners = [] if target is None else [
         folder.find_corners(each.image, target, one)
@@ -212,7 +219,8 @@ def prepare(
     records = _write_records(sides, place, name, overwrite=overwrite)
     pipeline = _experiment(sides, records, dictionary, settings, place, name)
     markers = sum(int(each.record.shown.sum()) for each in sides)
-    return Prepared(pipeline, tuple(lines), len(first.photographs), markers)
+    return Prepared(pipeline, tuple(lines), len(first.photographs), markers,
+                    os.fspath(store or place / f"{name}.zarr"))
 
 
 def record_home(store: PathName | None) -> tuple[str, str]:

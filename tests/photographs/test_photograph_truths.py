@@ -120,7 +120,7 @@ def test_the_other_camera_is_the_truth_in_two_folders_and_side_by_side(stereo, t
     records = {}
     for name, folders in (("two", ["left", "right"]), ("one", ["both"])):
         made = prepare([stereo / each for each in folders], stereo=stereo / "rig.yml",
-                       board=stereo / "board.toml", home=tmp_path, name=name)
+                       board=stereo / "board.toml", store=tmp_path / f"{name}.zarr")
         records[name] = [record_of(made, f"{name}-{side}") for side in ("left", "right")]
         assert made.photographs == 3
         assert "in 3 pairs of photographs; truth: stereo partner" in made.lines[-1]

@@ -411,8 +411,7 @@ def limit(
     if isinstance(pipeline, (str, os.PathLike)) and lifecycle.names_store(pipeline):
         stored = lifecycle.open_store(os.fspath(pipeline))
         if stored.pipeline.stopping is None and stored.pipeline.axis("trial") is not None:
-            if not stored.finished:
-                raise StoreError(lifecycle.unfinished_line(stored))
+            lifecycle.open_finished(stored.url)
             results = lifecycle.open_dataset(os.fspath(pipeline))
             limits = requirement_limits(results, require, along, per, at_all)
             return limits.assign_attrs(store=os.fspath(pipeline))

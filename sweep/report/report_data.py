@@ -26,7 +26,7 @@ from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.report.table import Column, Table, Value, axis_label, column, number
-from sweep.store.lifecycle import open_dataset, open_store, unfinished_line
+from sweep.store.lifecycle import open_dataset, open_finished
 from sweep.tradeoff.pareto import WRONG, conditions_of, configuration_label
 from sweep.typing import Floats
 
@@ -230,9 +230,7 @@ def read_report_data(
     StoreError
         If there is no store, it is not finished, or it cannot be read.
     """
-    store = open_store(url)
-    if not store.finished:
-        raise StoreError(unfinished_line(store))
+    store = open_finished(url)
     trade = None
     with store_errors(store.url):
         if "cost/tradeoff" in store.group:

@@ -617,25 +617,22 @@ def write_root(
 
 
 # --------------------------------------------------------------------------------------------------
-# Lines on a store that is not finished: who writes it, or how to continue it.
+# A store that is finished: of another one, who writes it, or how to continue it.
 
-def unfinished_line(store: RunStore) -> str:
-    """Return a line on a store that is not finished: its blocks, and what to do.
+def open_finished(url: str, mode: str = "r") -> RunStore:
+    """Open a store.
 
-    A run continues one that no process writes.
+    Raises
+    ------
+    StoreError
+        If it is not finished: how many blocks it has, and what to do.
     """
-    done, total = len(blocks.committed(store)), len(store.blocks)
-    after = "`sweep run` continues it"
-    if is_written(store.storage):
-        after = "it is being written: wait until it is finished"
-    return f"{store.url}: unfinished: {done:,} of {total:,} blocks; {after}"
-
-
-def open_finished(url: str) -> RunStore:
-    """Open a store; StoreError if it is not finished."""
-    store = open_store(url)
+    store = open_store(url, mode)
     if not store.finished:
-        raise StoreError(unfinished_line(store))
+        after = ("it is being written: wait until it is finished" if is_written(store.storage)
+                 else "`sweep run` continues it")
+        raise StoreError(f"{store.url}: unfinished: {len(blocks.committed(store)):,} of "
+                         f"{len(store.blocks):,} blocks; {after}")
     return store
 
 

@@ -25,7 +25,7 @@ from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import nearest
 from sweep.plugins.loading import is_recording, printing_to_stderr
-from sweep.store.lifecycle import open_dataset, open_store, unfinished_line, write_groups
+from sweep.store.lifecycle import open_dataset, open_finished, write_groups
 from sweep.store.lock import changing
 from sweep.store.provenance import differences
 from sweep.tradeoff import costs
@@ -83,9 +83,7 @@ def measure_trade(
         If ``per`` names no axis of the scenes.
     """
     started = time.perf_counter()
-    store = open_store(url, "r+")
-    if not store.finished:
-        raise StoreError(unfinished_line(store))
+    store = open_finished(url, "r+")
     stored, results = store.pipeline, open_dataset(url)
     for plugin in stored.plugins:
         if is_recording(plugin.name):

@@ -34,8 +34,8 @@ from sweep.typing import Floats
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 
 SHAPES = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
-#: Text; secondary text and lines; background.
-INK, FAINT, PAPER = "#282828", "#7a7a7a", "#ffffff"
+#: Text and lines; background.
+INK, PAPER = "#282828", "#ffffff"
 
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
@@ -117,7 +117,7 @@ class Figure:
 
     @property
     def panels(self) -> list[Panel]:
-        """Its drawings."""
+        """Its drawings with a finite value; if there is none, the first."""
         curves = [each for each in self.curves if each.heading in self.table.headings]
         stub = self.table.headings[: self.table.stub]
         rows, x, names = self.table.frame.to_dict("records"), self.x, []
@@ -128,9 +128,11 @@ class Figure:
             names = [", ".join(coordinate(row[name]) for name in stub) for row in rows]
             by = [] if self.by in stub else by
         parts = list(_groups(rows, apart).items())[:MAX_PANELS]
-        return [Panel(", ".join(filter(None, (heading_title(curve), words))),
-                      self._lines(curve, part, x, by), "" if names else x, curve, names)
-                for curve in curves for words, part in parts]
+        panels = [Panel(", ".join(filter(None, (heading_title(curve), words))),
+                        self._lines(curve, part, x, by), "" if names else x, curve, names)
+                  for curve in curves for words, part in parts]
+        return [panel for panel in panels if any(
+            np.isfinite(line.values).any() for line in panel.lines)] or panels[:1]
 
     def _lines(
         self, curve: Column, rows: Sequence[dict[str, Any]], x: str, by: Sequence[str]
@@ -280,9 +282,6 @@ class Panel:
             _draw_line(axes, line, k, limits, shift, rows=rows)
         if curve.level is not None:
             (axes.axvline if rows else axes.axhline)(curve.level, **REFERENCE)
-        if not any(np.isfinite(line.values).any() for line in self.lines):
-            axes.text(0.5, 0.5, "no finite values", transform=axes.transAxes, ha="center",
-                      va="center", color=FAINT)
         for artist in (*axes.lines, *axes.collections):
             artist.set_in_layout(False)  # the labels alone are laid out
         for line in self.lines:

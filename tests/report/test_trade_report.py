@@ -79,7 +79,7 @@ def bare():
 
 
 @pytest.mark.parametrize(("trade", "conditions"), [
-    (synthetic(), 3), (synthetic([20], treatments=1), 1), (spoilt(), 2), (bare(), 1)],
+    (synthetic(), 3), (synthetic([20], treatments=1), 1), (spoilt(), 1), (bare(), 1)],
     ids=["three regimes", "one treatment", "spoilt", "bare"])
 def test_tables_and_figures_have_every_treatment_of_every_condition(trade, conditions):
     table = tradeoff_table(trade, P95)
@@ -96,7 +96,7 @@ def test_tables_and_figures_have_every_treatment_of_every_condition(trade, condi
         axes = Figure().add_subplot()
         panel.draw(axes)
         part = front.isel(side_px=k) if "side_px" in front.dims else front
-        named = {text.get_text() for text in axes.texts} - {"no finite values"}
+        named = {text.get_text() for text in axes.texts}
         assert set(part["treatment"].values[part["on_front"].values]) <= named
         assert named <= set(part["treatment"].values)
     assert panels_file(figure.panels[:1], ".svg").startswith(b"<?xml")

@@ -147,14 +147,6 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     return source
 
 
-def is_reusable(pipeline: Pipeline, store: RunStore) -> bool:
-    """Return whether a new grid could reuse cells of a store that have been computed."""
-    try:
-        return bool(match(pipeline, store).done)
-    except StoreError:
-        return False
-
-
 def read_cells(
     pipeline: Pipeline, block: Block, sources: Sequence[Source], cells: CellsResult
 ) -> tuple[Masks, set[str]]:

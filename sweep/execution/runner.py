@@ -13,18 +13,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
-from sweep import compilation
-from sweep.errors import (
-    ArgumentError,
-    PipelineError,
-    RunError,
-    StoreError,
-    StoreReplacedError,
-    check_positive,
-    path_of,
-)
+from sweep import compilation, errors
 from sweep.execution import forecast, status
-from sweep.execution.block_task import is_reusable, match
+from sweep.execution.block_task import match
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport, progress_report
 from sweep.execution.waves import InWaves
@@ -132,17 +123,17 @@ def execute(
     """
     started = time.perf_counter()
     rule = make_rule(pipeline)  # it refuses names that it does not know
-    check_positive("workers", workers, "expected at least 1", whole=True)
+    errors.check_positive("workers", workers, "expected at least 1", whole=True)
     if scheduler is not None and client is not None:
-        raise ArgumentError("scheduler", scheduler, "expected no client beside it")
-    check_positive("time_limit_s", time_limit_s, "expected seconds above 0")
+        raise errors.ArgumentError("scheduler", scheduler, "expected no client beside it")
+    errors.check_positive("time_limit_s", time_limit_s, "expected seconds above 0")
     reuse = reuse if isinstance(reuse, Sequence) and not isinstance(reuse, str) else [reuse]
     if retry_failed and reuse:
-        raise ArgumentError(
-            "reuse", path_of("reuse", reuse[0]), "expected no retry_failed beside it")
+        raise errors.ArgumentError(
+            "reuse", errors.path_of("reuse", reuse[0]), "expected no retry_failed beside it")
     if progress is not None:
         announce_compilation(pipeline)
-    url = path_of("store", store) if store is not None else f"runs/{pipeline.name}.zarr"
+    url = errors.path_of("store", store) if store is not None else f"runs/{pipeline.name}.zarr"
     begun = _store_to_continue(url, pipeline, overwrite)
     again = status.failed_blocks(begun) if retry_failed and begun is not None else {}
     stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
@@ -183,7 +174,7 @@ def execute(
         expected = forecast.forecast_of(
             url, pipeline, timing, cut, executor.threads, len(cut) - len(done))
         if expected.objections and not (yes or sources):
-            raise StoreError(
+            raise errors.StoreError(
                 f"{url}: the run {' and '.join(expected.objections)}; make it smaller, or confirm "
                 "it with `--yes` (in Python, yes=True)")
         if begun is None:
@@ -195,13 +186,13 @@ def execute(
         limit_s = forecast.block_time_limit_s(time_limit_s, timing.pose_s * len(begun.blocks[0]))
         try:
             computed = compute(begun, executor, sources, limit_s, interrupts, progress)
-        except StoreReplacedError as error:
-            raise RunError(str(error)) from None
-        except (RunError, StoreError) as error:
+        except errors.StoreReplacedError as error:
+            raise errors.RunError(str(error)) from None
+        except (errors.RunError, errors.StoreError) as error:
             first, *others = str(error).splitlines()
             without = " without overwrite" if overwrite else ""
             advice = f"{first}; run it again{without} to continue"
-            raise RunError("\n".join([advice, *others])) from None
+            raise errors.RunError("\n".join([advice, *others])) from None
     return status.summary_of(
         lifecycle.open_store(url), computed, time.perf_counter() - started, again)
 
@@ -222,9 +213,11 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
     store = lifecycle.open_store(url, "r+")
     lines = differences(pipeline, store.pipeline, store.fingerprint)
     if lines:
-        advice = ("its cells can be reused: give another store, and this one as reuse"
-                  if is_reusable(pipeline, store) else "choose another store, or overwrite it")
-        raise StoreError("\n  ".join([f"{url}: holds another experiment; {advice}", *lines]))
+        advice = "choose another store, or overwrite it"
+        with contextlib.suppress(errors.StoreError):
+            if match(pipeline, store).done:
+                advice = "its cells can be reused: give another store, and this one as reuse"
+        raise errors.StoreError("\n  ".join([f"{url}: holds another experiment; {advice}", *lines]))
     return store
 
 
@@ -232,10 +225,11 @@ def _matching_sources(
     url: str, pipeline: Pipeline, reuse: Sequence[str | os.PathLike[str]]
 ) -> list[str]:
     """Return the addresses of the stores to reuse; StoreError if one has no cell in common."""
-    sources = [absolute_url(path_of("reuse", source)) for source in reuse]
+    sources = [absolute_url(errors.path_of("reuse", source)) for source in reuse]
     for source in sources:
         if source == absolute_url(url):
-            raise ArgumentError("reuse", source, "it is the store that is written; choose another")
+            raise errors.ArgumentError(
+                "reuse", source, "it is the store that is written; choose another")
         match(pipeline, lifecycle.open_store(source))
     return sources
 
@@ -317,12 +311,11 @@ def compute(
                     computed.update({"blocks": 1, **result.computed})
                     totals.add(result)
                     report()
-            if failed and all(each.machine_fault for each in failed):
-                raise RunError(
-                    f"{store.url}: {len(failed)} blocks failed; {failed[0].reason}")
             if failed:
-                raise RunError("\n  ".join([f"{store.url}: {len(failed)} blocks failed",
-                                            *(each.reason for each in failed)]))
+                count = f"{store.url}: {len(failed)} blocks failed"
+                if all(each.machine_fault for each in failed):
+                    raise errors.RunError(f"{count}; {failed[0].reason}")
+                raise errors.RunError("\n  ".join([count, *(each.reason for each in failed)]))
         if not store.finished:  # by another process that wrote it, too
             status.close(store)
     return computed
@@ -419,7 +412,7 @@ def limit(
             store = pipeline
     try:
         read = lifecycle.read_pipeline(pipeline, [*settings, *chosen])
-    except PipelineError as error:
+    except errors.PipelineError as error:
         if NO_TRIALS not in str(error):
             raise
         chosen += search_settings(max_trials=MAX_TRIALS)
@@ -428,7 +421,8 @@ def limit(
     if not searched:
         names = [axis.name for axis in read.axes_of(Stage.scene)
                  if axis.is_numeric and axis.name != TRIAL]
-        raise ArgumentError("along", along, f"expected one of {', '.join(names) or 'its axes'}")
+        raise errors.ArgumentError(
+            "along", along, f"expected one of {', '.join(names) or 'its axes'}")
     if store is None:
         store = Path("runs") / f"{read.name}-limit-{searched}.zarr"
     with progress_report(progress) as report:

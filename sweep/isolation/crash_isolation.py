@@ -125,7 +125,6 @@ class _IsolatedCells:
         for name, seconds in part.seconds.items():
             if stage in ("", name):
                 self.cells.seconds[name] = np.add(self.cells.seconds[name], seconds).tolist()
-        self.cells.row_seconds[rows] += part.row_seconds
         self.cells.failures += [
             dataclasses.replace(each, scene=int(rows[each.scene])) for each in part.failures
             if stage in ("", each.stage)]

@@ -6,10 +6,9 @@ import dataclasses
 import socket
 import time
 from collections.abc import Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from sweep.evaluation.block import run_cells, warm_up
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution import TIME_LIMIT_S
-from sweep.experiment.grid import TRIAL, Axis, Block
+from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage, lacking_plugins
 from sweep.experiment.pipeline import Pipeline, file_digest
 from sweep.experiment.sampling import StoppingRule
@@ -33,45 +32,22 @@ from sweep.store import blocks
 from sweep.store.blocks import Receipt, RunStore
 from sweep.store.lifecycle import open_store
 from sweep.store.locations import exists
-from sweep.store.provenance import changes, differences, fingerprint
+from sweep.store.provenance import Source, both_axes, changes, fingerprint, match
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
 # Finished cells of other stores, copied into a new one: grids grow, halves are joined.
 #
-# A cell is reusable if the fingerprint and all its parameter values agree, and nothing of it
-# failed or crashed. Whether a parameter is fixed, an axis of its own, or goes together with others
-# does not matter: a cell of the new grid gives every parameter a value, and these are looked up in
-# the old grid, where a parameter that it keeps fixed is an axis of one value. Which cells an old
-# store has finished follows from its receipts and flags; the old store is only read.
-
-class Source(NamedTuple):
-    """An old store, and the numbers of its committed blocks."""
-
-    store: RunStore
-    done: AbstractSet[int]
-
-
-def _axes(pipeline: Pipeline, names: AbstractSet[str]) -> list[Axis]:
-    """Return a pipeline's axes, stage by stage, and an axis of one value for each other name."""
-    own = {name for axis in pipeline.axes for name in axis.columns}
-    fixed = pipeline.fixed | {TRIAL: 0}
-    return [*sorted(pipeline.axes, key=lambda axis: axis.stage),
-            *(Axis(name, {name: (fixed.get(name),)}) for name in sorted(names - own))]
-
-
-def _both_axes(new: Pipeline, old: Pipeline) -> tuple[list[Axis], list[Axis]]:
-    """Return the axes of two grids, each with those that only the other has."""
-    names = {name for grid in (new, old) for axis in grid.axes for name in axis.columns}
-    return _axes(new, names), _axes(old, names)
-
+# A cell is reusable if the stores match, all its parameter values agree, and nothing of it failed
+# or crashed. Which cells an old store has finished follows from its receipts and flags; the old
+# store is only read.
 
 def _rows(pipeline: Pipeline, block: Block, old: Pipeline) -> dict[str, NDArray[np.intp]]:
     """Return axis of an old grid -> row along it of each cell of a block, -1 without.
 
     They are of shape (scenes, detector settings, estimators).
     """
-    new_axes, old_axes = _both_axes(pipeline, old)
+    new_axes, old_axes = both_axes(pipeline, old)
     scenes = pipeline.axes_of(Stage.scene)
     starts = dict(zip((axis.name for axis in scenes), block.starts, strict=True))
     lengths = dict(zip(starts, block.shape, strict=True))
@@ -110,41 +86,6 @@ LOST = {
     "estimate": (EstimateStatus.failed, EstimateStatus.crashed,
                  EstimateStatus.not_run, EstimateStatus.not_needed),
 }
-
-
-def match(pipeline: Pipeline, store: RunStore) -> Source:
-    """Match a new grid to an old store's.
-
-    Raises
-    ------
-    StoreError
-        If no cell is reusable: another fingerprint, or parameters that never agree; or if chunks
-        of committed blocks are missing.
-    """
-    old = store.pipeline
-    mine, theirs = fingerprint(pipeline), store.fingerprint
-    # A file or plug-in that only one of them refers to is a value that only one of them has.
-    for part in ("files", "plugins"):
-        shared = mine.get(part, {}).keys() & theirs.get(part, {}).keys()
-        for stamp in (mine, theirs):
-            stamp[part] = {name: stamp[part][name] for name in sorted(shared)}
-    present = {variable.name for variable in store.variables}
-    lacking = [variable.name for variable in pipeline.experiment.variables
-               if variable.name not in present and not variable.drawn_as]
-    source = Source(store, blocks.check_whole(store))
-    here, there = ({name: values for axis in axes for name, values in axis.columns.items()}
-                   for axes in _both_axes(pipeline, old))
-    agree = (
-        not any(changes(theirs, mine)) and pipeline.distributions == old.distributions
-        and all(pipeline.fixed[name] == old.fixed[name]
-                for name in pipeline.fixed.keys() & old.fixed.keys())
-        and all(not set(values).isdisjoint(there[name]) for name, values in here.items())
-    )
-    if lacking or not agree:
-        lines = [f"{name}: not a variable of the store" for name in lacking]
-        lines += differences(pipeline, old, store.fingerprint)
-        raise StoreError("\n  ".join([f"{store.url}: no cell of it can be reused", *lines]))
-    return source
 
 
 def read_cells(

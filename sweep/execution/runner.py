@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from sweep import compilation, errors
 from sweep.execution import forecast, status
-from sweep.execution.block_task import match
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport, progress_report
 from sweep.execution.waves import InWaves
@@ -31,7 +30,7 @@ from sweep.store import blocks, lifecycle
 from sweep.store.blocks import RunStore
 from sweep.store.locations import absolute_url, check_writable, exists, open_storage
 from sweep.store.lock import changing, is_written, writing
-from sweep.store.provenance import differences
+from sweep.store.provenance import differences, match
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Iterator, Mapping
+from collections.abc import Set as AbstractSet
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import llvmlite
 import numba
 import numpy as np
 
+from sweep.errors import StoreError
 from sweep.experiment.draws import SAMPLINGS
-from sweep.experiment.grid import MAX_LISTED, Axis
+from sweep.experiment.grid import MAX_LISTED, TRIAL, Axis
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import not_continued
+from sweep.store import blocks
+from sweep.store.blocks import RunStore
 from sweep.version import __version__
 
 #: Raised whenever the numbers change; a test with golden digests fails if it is not.
@@ -151,3 +155,69 @@ def excerpt(values: Any) -> str:
     if len(values) <= 6:
         return ", ".join(str(value) for value in values)
     return f"{values[0]}, {values[1]}, ... {values[-1]} ({len(values):,} values)"
+
+
+# --------------------------------------------------------------------------------------------------
+# Which stores have cells of a new grid: the fingerprint and all values of parameters agree.
+#
+# Whether a parameter is fixed, an axis of its own, or goes together with others does not matter: a
+# cell of the new grid gives every parameter a value, and these are looked up in the old grid, where
+# a parameter that it keeps fixed is an axis of one value.
+
+class Source(NamedTuple):
+    """An old store, and the numbers of its committed blocks."""
+
+    store: RunStore
+    done: AbstractSet[int]
+
+
+def _axes(pipeline: Pipeline, names: AbstractSet[str]) -> list[Axis]:
+    """Return a pipeline's axes, stage by stage, and an axis of one value for each other name."""
+    own = {name for axis in pipeline.axes for name in axis.columns}
+    fixed = pipeline.fixed | {TRIAL: 0}
+    return [*sorted(pipeline.axes, key=lambda axis: axis.stage),
+            *(Axis(name, {name: (fixed.get(name),)}) for name in sorted(names - own))]
+
+
+def both_axes(new: Pipeline, old: Pipeline) -> tuple[list[Axis], list[Axis]]:
+    """Return the axes of two grids, each with those that only the other has."""
+    names = {name for grid in (new, old) for axis in grid.axes for name in axis.columns}
+    return _axes(new, names), _axes(old, names)
+
+
+def match(pipeline: Pipeline, store: RunStore) -> Source:
+    """Match a new grid to an old store's.
+
+    Raises
+    ------
+    StoreError
+        If no cell is reusable: another fingerprint, or parameters that never agree; or if chunks
+        of committed blocks are missing.
+    """
+    old = store.pipeline
+    mine, theirs = fingerprint(pipeline), store.fingerprint
+    # A file or plug-in that only one of them refers to is a value that only one of them has.
+    for part in ("files", "plugins"):
+        shared = mine.get(part, {}).keys() & theirs.get(part, {}).keys()
+        for stamp in (mine, theirs):
+            stamp[part] = {name: stamp[part][name] for name in sorted(shared)}
+    present = {variable.name for variable in store.variables}
+    lacking = [variable.name for variable in pipeline.experiment.variables
+               if variable.name not in present and not variable.drawn_as]
+    source = Source(store, blocks.check_whole(store))
+    # Ranges, as of trials, may be long: they are never written out.
+    here, there = (
+        {name: values if isinstance(values, range) else frozenset(values)
+         for axis in axes for name, values in axis.columns.items()}
+        for axes in both_axes(pipeline, old))
+    agree = (
+        not any(changes(theirs, mine)) and pipeline.distributions == old.distributions
+        and all(pipeline.fixed[name] == old.fixed[name]
+                for name in pipeline.fixed.keys() & old.fixed.keys())
+        and all(any(value in there[name] for value in values) for name, values in here.items())
+    )
+    if lacking or not agree:
+        lines = [f"{name}: not a variable of the store" for name in lacking]
+        lines += differences(pipeline, old, store.fingerprint)
+        raise StoreError("\n  ".join([f"{store.url}: no cell of it can be reused", *lines]))
+    return source

@@ -45,6 +45,7 @@ from sweep.measure.likelihood import QUANTISATION_VARIANCE
 from sweep.measure.solver import marker_frame, of_board
 from sweep.measure.surroundings import clear_modules
 from sweep.messages import notice, plain
+from sweep.model.sensor import displaced
 from sweep.photographs import cameras, prepare
 from sweep.photographs.prepare import PathName
 from sweep.store.files import write_whole
@@ -81,16 +82,12 @@ class Estimate(NamedTuple):
         return Estimate(*map(function, self))
 
 
-#: What nothing is known of.
-UNKNOWN = Estimate()
-
-
 def estimate(values: Floats) -> Estimate:
     """Return the mean of a parameter's values (n,) in n photographs; the interval is Student's."""
     known = values[np.isfinite(values)]
     count = len(known)
     if not count:
-        return UNKNOWN
+        return Estimate()
     mean = float(known.mean())
     if count < MIN_PHOTOGRAPHS:
         return Estimate(mean)
@@ -130,9 +127,9 @@ class Field(NamedTuple):
     ``variance`` (px²) is the mean of unbiased estimates by each photograph: it may be below 0.
     """
 
-    size_px: Estimate = UNKNOWN
-    length_px: Estimate = UNKNOWN
-    variance: Estimate = UNKNOWN
+    size_px: Estimate = Estimate()
+    length_px: Estimate = Estimate()
+    variance: Estimate = Estimate()
 
     def covariance(self, distances: Floats, cell_px: float) -> Floats:
         """Return the covariance in px² of means over cells at squared distances (px²).
@@ -504,14 +501,16 @@ class SceneFit(NamedTuple):
         How many of them were fitted.
     lines
         Lines for the user beside the terms.
-    tested_fits
-        The fits with all effects, by the photograph's number.
+    views, tested_fits
+        The pixels that were fitted, as if evenly spaced, and the fits with all effects, by the
+        photograph's number.
     """
 
     terms: tuple[Term, ...]
     photographs: int
     markers: int
     lines: list[str]
+    views: Views
     tested_fits: Mapping[int, PhotographFit]
 
     @property
@@ -521,15 +520,39 @@ class SceneFit(NamedTuple):
 
 
 # --------------------------------------------------------------------------------------------------
+# Pixels that are not evenly spaced: the camera took each from a larger image.
+
+#: Pixels of the larger image for one of the frame that are tried.
+DECIMATIONS = sorted({p / q for q in range(2, 6) for p in range(q + 1, 2 * q)})
+
+
+def decimation_of(fits: Sequence[PhotographFit]) -> Term:
+    """Return the term of the spacing of pixels that leaves the least squares of residuals.
+
+    A spacing that is not the photographs' adds as much as it would explain.
+    """
+    states = [state for fit in fits for state in fit.states]
+    squares = {
+        each: sum(((one.residuals - _displacing(one, each)) ** 2).sum() for one in states)
+        for each in (1.0, *DECIMATIONS)
+    }
+    best = min(squares, key=lambda each: squares[each])
+    reason = "pixels are taken from a larger image: photograph in the camera's own resolution"
+    return Term("spacing of pixels", "decimation", Estimate(best), best != 1.0,
+                reason if best != 1.0 else "pixels are evenly spaced")
+
+
+def _displacing(state: MarkerState, decimation: float) -> Floats:
+    """Return by how much the levels (n,) differ from evenly spaced pixels', to first order."""
+    places = np.argwhere(state.marker.used).T[::-1] + state.marker.frame_px[:, None]
+    return np.asarray(-(displaced(places, decimation) * state.slope).sum(axis=0))
+
+
+# --------------------------------------------------------------------------------------------------
 # A camera's scene from photographs of known markers: every term with its interval.
 
-#: Photographs from one line of progress to the next.
-SAID = 5
-
-
 def fit_scene(
-    views: Views, refused: Collection[str] = (),
-    known: Mapping[int, PhotographFit] | None = None,
+    views: Views, refused: Collection[str] = (), known: SceneFit | None = None
 ) -> SceneFit:
     """Return the scene of a camera from its photographs.
 
@@ -540,7 +563,7 @@ def fit_scene(
     refused
         Switches of effects that are left out, for errors are nearer without them.
     known
-        Fits of all effects, of an earlier scene's (:attr:`SceneFit.tested_fits`).
+        An earlier scene of these views and others, whose fits of all effects are taken.
 
     Raises
     ------
@@ -548,7 +571,14 @@ def fit_scene(
         If nothing can be fitted, in a line.
     """
     all_moved = np.ones(len(START), dtype=bool)
-    every = _fitted(views, all_moved, START) if known is None else known
+    every = _fitted(views, all_moved, START) if known is None else known.tested_fits
+    decimation = decimation_of(list(every.values())) if known is None else known.terms[0]
+    if known is None and decimation.kept:
+        views = {number: [
+            each.marker._replace(levels=each.marker.levels - _displacing(each, decimation.value))
+            for each in fit.states
+        ] for number, fit in every.items()}
+        every = _fitted(views, all_moved, START)
     tested_fits = {number: fit for number, fit in every.items() if number in views}
     if not tested_fits:
         raise ArgumentError(
@@ -569,12 +599,7 @@ def fit_scene(
         for each, keep, test in zip(_optics(found), kept, tested, strict=True)
     ]
     fits, lines = list(found.values()), []
-    terms = _terms(fits, optics, tested, refused)
-    if len(fits) < MIN_PHOTOGRAPHS:
-        lines.append(
-            f"photographs that could be fitted: {len(fits)}; from {MIN_PHOTOGRAPHS} on "
-            "values have intervals, and effects that are not there are left out"
-        )
+    terms = _terms(fits, optics, tested, refused, decimation)
     size = next(each for each in terms if each.parameter == "marker_scale")
     if size.kept and math.isfinite(size.estimate.low):
         value, low, high = (100.0 * (each - 1.0) for each in size.estimate)
@@ -583,17 +608,16 @@ def fit_scene(
             "measure the print"
         )
     markers = sum(len(fit.states) for fit in fits)
-    return SceneFit(tuple(terms), len(fits), markers, lines, tested_fits)
+    return SceneFit(tuple(terms), len(fits), markers, lines, views, tested_fits)
 
 
 def _fitted(views: Views, moved: Masks, start: Floats) -> dict[int, PhotographFit]:
     """Return the fits of photographs by number, of those in which a marker can be fitted."""
     fits = {}
     for count, (number, markers) in enumerate(views.items()):
-        if count % SAID == 0:
+        if count % 5 == 0:  # a line of progress for each five
             notice(f"fitting photograph {count + 1} of {len(views)}")
-        fit = fit_photograph(markers, moved, start)
-        if fit is not None:
+        if (fit := fit_photograph(markers, moved, start)) is not None:
             fits[number] = fit
     return fits
 
@@ -605,9 +629,9 @@ def _optics(fits: Mapping[int, PhotographFit]) -> list[Estimate]:
 
 def _terms(
     fits: Sequence[PhotographFit], optics: Sequence[Estimate], tested: Sequence[Estimate],
-    refused: Collection[str],
+    refused: Collection[str], decimation: Term,
 ) -> list[Term]:
-    """Return the terms of fitted photographs.
+    """Return the terms of fitted photographs, ``decimation`` first.
 
     ``optics`` and ``tested`` are variance, amount and bloom as found, and as they are judged.
     """
@@ -645,16 +669,19 @@ def _terms(
     ]
     edges = edge_field(fits)
     ragged = with_reach("ragged edges", "edge_px", edges, "no pixels that say it")
-    # The mean profile of edges that are shifted is wider by the variance of their shifts.
+    # The mean profile of edges that are shifted is wider by the variance of their shifts, and of
+    # displaced pixels, which were evened to first order, by theirs: 60 are whole periods of all.
     widened = edges.size_px.value**2 if ragged[0].kept else 0.0
+    widened += float(displaced(np.arange(60), decimation.estimate.value).var())
     variance, amount, bloom = zip(optics, tested, strict=True)
     blur = variance[0].mapped(lambda square: math.sqrt(max(square - widened, 0.0)))
-    scale, geometry, unknown = UNKNOWN, Field(), "only beside a board or exact poses"
+    scale, geometry, unknown = Estimate(), Field(), "only beside a board or exact poses"
     source = fits[0].states[0].marker.shown.source
     if source in (TruthSource.board_without_this_marker, TruthSource.poses_file):
         scale, unknown = of_photographs(_scale), "too few photographs or markers"
         geometry = geometry_field(fits, edges, scale.value)
     return [
+        decimation,
         Term("black", "black", black), Term("white", "white", white),
         Term("around the marker", "background", ground),
         judge("blur", "blur_px", blur, variance[1]),
@@ -682,13 +709,9 @@ def _scale(state: MarkerState) -> float:
 #: Held-out photographs from which errors have intervals.
 MIN_HELD_OUT = 5
 
-#: Markers of a photograph whose errors are compared.
-MAX_MARKERS = 12
-
-#: Simulations of each photograph. With one, the simulation's own random errors decide whether an
-#: effect narrows the gap. Effects that move no error (light, the noise's correlation) changed it by
-#: ± 0.02 half-widths of the intervals (standard deviation) with eight.
-REPEATS = 4
+#: Simulations of each photograph, with all its markers. With one, the simulation's own random
+#: errors decide whether an effect narrows the gap.
+REPEATS = 2
 
 #: Half-widths of the intervals by which the mean gap is narrower without an effect that is left
 #: out: a standard deviation of the photographs' own random errors. Of rendered photographs, gaps
@@ -715,9 +738,7 @@ def gap_size(gap: xr.Dataset, widths: xr.Dataset) -> float:
             if each.ratio:
                 value, low, high = np.log(value), np.log(low), np.log(high)
             sizes.append((np.abs(value) / (0.5 * (high - low))).ravel())
-    every = np.concatenate(sizes)
-    known = every[np.isfinite(every)]
-    return float(known.mean()) if len(known) else math.nan
+    return estimate(np.concatenate(sizes)).value
 
 
 def needed(whole: xr.Dataset, without: Mapping[str, xr.Dataset]) -> dict[str, bool]:
@@ -743,24 +764,19 @@ def held_out(pipeline: Pipeline, numbers: Integers, folder: Path) -> Pipeline:
     write_whole(folder / f"{name}{SUFFIX}", chosen.content())
     document = read_document(pipeline.to_toml())
     document["scene"][PHOTOGRAPHS] = f"{name}{SUFFIX}"
-    axes = document["axes"]
-    axes["trial"] = len(numbers)
-    if "marker_id" in axes:
-        every = record.marker_id
-        spread = np.unique(np.linspace(0, len(every) - 1, MAX_MARKERS).astype(np.int64))
-        axes["marker_id"] = every[spread].tolist()
+    document["axes"]["trial"] = len(numbers)
     return Pipeline.from_dict(document, name=name, source="held out", folder=folder)
 
 
 def checked(
-    found: SceneFit, views: Views, pipeline: Pipeline, home: Path
+    found: SceneFit, pipeline: Pipeline, home: Path
 ) -> tuple[SceneFit, xr.Dataset]:
     """Return the scene with what moves errors of held-out photographs, and the gap that is left.
 
     Every other photograph is held out, and the scene of the others simulated; stores go to
     ``home``.
     """
-    numbers, known = list(views), found.tested_fits
+    views, numbers = found.views, list(found.views)
     others, held = {number: views[number] for number in numbers[::2]}, np.array(numbers[1::2])
     notice(f"measuring {len(held)} photographs that the scene of the others is compared with")
     photographs = held_out(pipeline, held, home)
@@ -776,17 +792,17 @@ def checked(
         return simulation_gap(results, measured(twins, name)).load()
 
     results = measured(photographs, photographs.name)
-    half = fit_scene(others, known=known).scene
+    half = fit_scene(others, known=found).scene
     gap = gap_with(half, "the whole scene")
     kept = needed(gap, {
-        switch: gap_with(fit_scene(others, [switch], known).scene, f"all but {switch}")
+        switch: gap_with(fit_scene(others, [switch], found).scene, f"all but {switch}")
         for switch in SWITCHES if switch in half
     })
     refused = [switch for switch, keep in kept.items() if not keep]
     if refused:
-        rest = gap_with(fit_scene(others, refused, known).scene, "what is kept")
+        rest = gap_with(fit_scene(others, refused, found).scene, "what is kept")
         if gap_size(rest, gap) <= gap_size(gap, gap):
-            return fit_scene(views, refused, known), rest
+            return fit_scene(views, refused, found), rest
     return found, gap
 
 
@@ -794,12 +810,6 @@ def checked(
 # The file of a fitted scene: a whole pipeline of the camera, as TOML with its intervals.
 
 CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion")
-
-#: Share of the photographs' bearings that the poses of the pipeline keep to, lest their markers be
-#: cut by the frame.
-MAX_BEARING = 0.8
-
-TRIALS = 200
 
 
 def scene_document(pipeline: Pipeline, views: Views, found: SceneFit) -> dict[str, Any]:
@@ -816,7 +826,8 @@ def scene_document(pipeline: Pipeline, views: Views, found: SceneFit) -> dict[st
     rotation, translation = record.rotation[record.shown], record.translation[record.shown]
     tilt = np.degrees(np.arccos(np.clip(-rotation[:, 2, 2], -1, 1)))
     bearing = np.abs(translation[:, :2] / translation[:, 2:])
-    wide = np.degrees(np.arctan(MAX_BEARING * np.quantile(bearing, 0.9, axis=0))).tolist()
+    # Not all of the photographs' bearings, lest markers be cut by the frame.
+    wide = np.degrees(np.arctan(0.8 * np.quantile(bearing, 0.9, axis=0))).tolist()
     turned = {"uniform": [0.0, 360.0]}
     pose = {
         "distance_m": _between(translation[:, 2]), "tilt_deg": _between(tilt),
@@ -833,7 +844,7 @@ def scene_document(pipeline: Pipeline, views: Views, found: SceneFit) -> dict[st
         "marker": marker,
         "pose": pose,
         "scene": found.scene,
-        "axes": {"trial": TRIALS, "cornerRefinementMethod": ["none", "subpix"]},
+        "axes": {"trial": 200, "cornerRefinementMethod": ["none", "subpix"]},
     }
 
 
@@ -955,7 +966,7 @@ def fit(
         views, lines = photograph_views(pipeline, markers)
         found, gap = fit_scene(views), None
         if check and len(views) >= 2 * MIN_HELD_OUT:
-            found, gap = checked(found, views, pipeline, home)
+            found, gap = checked(found, pipeline, home)
         elif check:
             lines.append(
                 f"fewer than {2 * MIN_HELD_OUT} photographs: no half of them is held out, to see "

@@ -256,9 +256,8 @@ def drawn(ends: Floats, sides: Integers, size: tuple[int, int], sigma_px: float)
     edges = MarkerEdges(np.ascontiguousarray(ends.reshape(-1, 4)), sides)
     add_plane(space, edges, WHITE_SHARE, IN_PIXELS, sigma_px, PANEL_PX)
     rates = np.moveaxis(space.rates.reshape(height, width + 1, 4)[:, :width], 2, 0)
-    white, outside = (
-        np.cumsum(each, axis=1) for each in (rates[0], space.outside[:, :width])
-    )
+    white = np.cumsum(rates[0], axis=1)
+    outside = np.cumsum(space.outside[:, :width], axis=1)
     return np.stack([white, *rates[1:], outside])
 
 

@@ -145,11 +145,8 @@ class Effect:
     @property
     def off_text(self) -> str:
         """The value at which it is absent, in words."""
-        if self.off is None:
-            return "not given"
-        if self.off == ():
-            return "[]"
-        return self.off if isinstance(self.off, str) else f"{self.off:g}"
+        words = {None: "not given", (): "[]"}.get(self.off, self.off)
+        return words if isinstance(words, str) else f"{words:g}"
 
     def is_active(self, strength: Any) -> Any:
         """Return whether it is on: numbers (...) as scenes hold them, NaN if not given."""
@@ -395,6 +392,14 @@ EFFECTS: tuple[Effect, ...] = (
             "light falls off; 4 is the natural law", 0, 100,
         ),
     }, widens="uneven light", apply=_lit),
+    Effect("decimation", "light", {
+        "decimation": parameter(
+            1.0, "column and row i are those of number floor(i · decimation) of a larger image, so "
+            "that pixels are not evenly spaced; a fraction of at most eighths", 1, 100,
+        ),
+    }, reach_px=sensor.TAPS_PX, apply=lambda levels, patch: sensor.decimated(
+        levels, patch.left, patch.top, patch.values["decimation"]
+    )),
     Effect("shot noise", "signal", {
         "full_well_e": drawn(
             None, "electrons that a pixel holds, at level 255 and gain 1; the shot noise is "

@@ -375,17 +375,26 @@ def _misfit(document: Mapping[str, Any], board: Board, seen: Sequence[SeenMarker
     return f"only {100 * share:.0f} % of the detected markers lie where it has them; {remedy}"
 
 
+def _flat_markers(
+    board: Board, seen: Sequence[SeenMarkers], least: int
+) -> Iterator[tuple[Floats, Floats, float]]:
+    """Yield corners (n, 4, 2) of a board's markers in m and px, where ``least`` of them are seen.
+
+    And the mean side in px of all markers there.
+    """
+    for one in seen:
+        marker, quads = one.among(board.marker_ids)
+        if len(marker) >= least:
+            yield board.corners_m[marker, :, :2], quads, float(side_lengths(one.quads).mean())
+
+
 def fitting_share(board: Board, seen: Sequence[SeenMarkers]) -> float:
     """Return the share of all detected markers that lie where a board has them."""
     fitting = 0
-    for one in seen:
-        marker, quads = one.among(board.marker_ids)
-        if len(marker) < 2:
-            continue
-        flat = board.corners_m[marker, :, :2]
+    for flat, quads, side_px in _flat_markers(board, seen, 2):
         transform, _ = cv2.findHomography(
             flat.reshape(-1, 2), quads.reshape(-1, 2), cv2.RANSAC,
-            FITTING_SHARE * float(side_lengths(one.quads).mean()) / 2,
+            FITTING_SHARE * side_px / 2,
         )
         if transform is None:
             continue
@@ -398,11 +407,7 @@ def fitting_share(board: Board, seen: Sequence[SeenMarkers]) -> float:
 def measured_side(board: Board, seen: Sequence[SeenMarkers]) -> float:
     """Return the side of the markers over the board's, by the distances of their centres."""
     ratios: list[float] = []
-    for one in seen:
-        marker, quads = one.among(board.marker_ids)
-        if len(marker) < 4:
-            continue
-        flat = board.corners_m[marker, :, :2]
+    for flat, quads, _ in _flat_markers(board, seen, 4):
         tolerance = float(np.ptp(flat[0], axis=0).max()) / 4
         transform, _ = cv2.findHomography(
             quads.mean(axis=1), flat.mean(axis=1), cv2.RANSAC, tolerance

@@ -172,8 +172,7 @@ def prepare(
     _check_arguments(folders, camera, board, poses, stereo)
     document = {} if board is None else board_document(Path(board))
     target = None if board is None else board_of(document, plain(board))
-    side_by_side = stereo is not None and len(folders) == 1
-    halves = (Part.left, Part.right) if side_by_side else (Part.whole,)
+    halves = (Part.left, Part.right) if stereo is not None and len(folders) == 1 else (Part.whole,)
     found = [folder.read_folder(Path(each), part) for each in folders for part in halves]
     lines = list(dict.fromkeys(line for shots in found for line in shots.lines))
     if stereo is not None:
@@ -525,8 +524,7 @@ def board_poses(side: Side, board: Board, found: Sequence[FoundCorners]) -> floa
     """
     camera, covariance = side.camera, cameras.covariance_of(side.camera)
     boards = [cameras.fitted_board(camera, each) for each in found]
-    ratio = _halves_ratio(camera, boards, found, 1 if len(board.chessboard_m) else 4)
-    raised = max(1.0, ratio) if np.isfinite(ratio) else 1.0
+    raised = _halves_ratio(camera, boards, found, 1 if len(board.chessboard_m) else 4)
     column = np.argsort(np.argsort(board.marker_ids)).tolist()
     own = folder.own_corners(board)
     for photograph, (pose, corners) in enumerate(zip(boards, found, strict=True)):
@@ -578,7 +576,7 @@ def _halves_ratio(
     camera: Calibration, boards: Sequence[FittedPose | None], found: Sequence[FoundCorners],
     together: int,
 ) -> float:
-    """Return how far the poses of two halves differ, in predicted standard deviations.
+    """Return how far the poses of two halves differ, in predicted standard deviations; at least 1.
 
     ``together`` corners of following numbers are in the same half: every other corner of a
     chessboard's row, or every other marker of a grid.
@@ -599,7 +597,7 @@ def _halves_ratio(
         difference = np.concatenate([turn, one.translation - other.translation])
         covariance = one.covariance + other.covariance
         squares.append(float(difference @ np.linalg.solve(covariance, difference)) / 6)
-    return float(np.sqrt(np.mean(squares))) if squares else float("nan")
+    return max(1.0, float(np.sqrt(np.mean(squares)))) if squares else 1.0
 
 
 # --------------------------------------------------------------------------------------------------

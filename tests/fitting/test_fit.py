@@ -25,7 +25,7 @@ TRUTH = {
     "marker_scale": 1.004, **LEVELS,
 }
 EFFECTS = TRUTH | {"noise_grey": 2.0}
-PLAIN = LEVELS | {"blur_px": 0.5, "noise_grey": 1.0}
+PLAIN = LEVELS | {"blur_px": 0.5, "noise_grey": 1.0, "decimation": 5 / 3}
 
 
 def drawn_pose(rng):
@@ -104,6 +104,7 @@ def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path)
     assert code == 0
     assert terms["blur_px"]["kept"]
     assert terms["blur_px"]["value"] == pytest.approx(0.5, abs=0.02)
+    assert found["scene"]["decimation"] == 1.667
     absent = [name for name in ("sharpening", "bloom", "geometry_px") if not terms[name]["kept"]]
     assert len(absent) >= 2  # a false alarm of each has a probability of 5 %
     for name in absent:

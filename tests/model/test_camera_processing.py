@@ -175,6 +175,20 @@ def test_demosaicing_is_opencvs_on_the_whole_frame(pattern, method, ending):
     assert np.abs(image - expected).max() <= 0.5 + 0.02
 
 
+def test_pixels_of_a_larger_image_are_displaced_along_both_axes():
+    # Pixel i is number floor(5 i / 3): at 0, 1 and 3 of 5, 0.2 px right, 0.2 px left and in place.
+    def seen(*settings):
+        return image_of(["blur_px=0.8", *settings]).astype(float)
+
+    expected, moved = seen(), (0.2, -0.2, 0.0)
+    for i, j in np.ndindex(3, 3):
+        at = seen(f"cx_px={28 - moved[j]}", f"cy_px={22 - moved[i]}")
+        expected[i::3, j::3] = at[i::3, j::3]
+    assert np.abs(seen("decimation=1.667") - expected).max() <= 1.5
+    assert np.abs(seen() - expected).max() > 12
+    np.testing.assert_array_equal(seen("decimation=2"), seen())
+
+
 # Windows.
 
 COMBINATIONS = {
@@ -188,7 +202,7 @@ COMBINATIONS = {
     "correlated": ["noise_grey=9", "noise_correlation=0.99", "noise_table=[0, 9, 255, 1]"],
     "bayer and JPEG": ["bayer=BGGR", "full_well_e=900", "jpeg_quality=1"],
     "tone and light": ["tone_gamma=2.2", "vignetting=4", "illumination_gradient=0.5", "bloom=1"],
-    "fine bits": ["tone_knee=1", "bit_depth=12", "sharpening=0.5", "gain=1.4"],
+    "fine bits": ["tone_knee=1", "bit_depth=12", "sharpening=0.5", "gain=1.4", "decimation=1.4"],
     "defocus": ["aperture_mm=9", "focus_distance_m=0.5", "sharpening=1", "tone_toe=0.5"],
     "bent sheet": [
         "curvature_per_m=4", "geometry_px=0.5", "marker_scale=1.1", "sharpening=1", "bayer=RGGB",

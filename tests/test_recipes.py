@@ -127,7 +127,7 @@ def effects():
     })
     indices = [index.ravel() for index in np.indices((2, 2, 2))]
     batch = scenes_at(pipeline.experiment, indices)
-    (result,), _ = detections_of(batch, np.ones((8, 1), dtype=bool), [], keep=True)
+    (result,) = detections_of(batch, np.ones((8, 1), dtype=bool), [], keep=True)
     box, setting = tuple(batch.boxes[0].tolist()), pipeline.experiment.detectors[0]
     mean, share = marker_levels(batch.scenes, 0, box)
     windows = search_windows(batch.scenes, batch.boxes, setting, np.zeros(8, dtype=bool))

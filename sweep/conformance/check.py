@@ -121,7 +121,7 @@ def answers_to(pipeline: Pipeline, kind: str, numbers: Sequence[int]) -> list[An
         If the plug-in raises, or returns what cannot be an answer.
     """
     batch, failures = scenes_at(pipeline.experiment, [np.array(numbers)]), list[Failure]()
-    (found,), _ = detections_of(batch, batch.visible[:, None], failures, keep=True)
+    (found,) = detections_of(batch, batch.visible[:, None], failures, keep=True)
     if failures:
         raise PluginError(failures[0].text.strip().rpartition("\n")[2].split(": ", 1)[-1])
     answers: list[Answer] = [()] * len(numbers)

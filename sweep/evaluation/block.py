@@ -228,7 +228,7 @@ def _run_batch(
 
     start = time.perf_counter()
     batch = scenes_at(experiment, indices)
-    found, result.row_seconds[part] = detections_of(
+    found = detections_of(
         batch, searched & batch.visible[:, None], failures,
         keep=bool(experiment.solvers_on_pixels),
     )

@@ -116,7 +116,7 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
     batch = scenes_at(experiment, _indices(experiment))
     scenes, target = batch.scenes, batch.targets.targets[0]
     image, window = _rendered(batch, whole_frame=whole_frame)
-    (searched,), _ = detections_of(batch, batch.visible[:, None], [])
+    (searched,) = detections_of(batch, batch.visible[:, None], [])
     output = searched.outputs.get(0, SearchOutput([], None, []))
     ids, origin = () if output.ids is None else output.ids.ravel(), searched.output_origins[0]
     length = float(scenes.size_m[0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +17,6 @@ from sweep.experiment.grid import Block, Grid
 from sweep.experiment.parameters import Stage
 from sweep.experiment.schema import SCHEMA, Tolerance, Variable
 from sweep.model.pose import rotation_of_vector
-from sweep.typing import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,15 +100,12 @@ class CellsResult:
         Variable -> (configurations of its stage, N, ...), the last axis of configurations fastest.
     seconds
         Time spent: "scene", then "detection" and "estimation" per configuration.
-    row_seconds
-        (N,) time spent on rendering and searching each scene.
     failures
         The exceptions that were raised; their cells are flagged ``failed``.
     """
 
     columns: dict[str, NDArray[Any]]
     seconds: dict[str, list[float]]
-    row_seconds: Floats
     failures: list[Failure] = field(default_factory=list)
 
     @staticmethod
@@ -130,24 +125,7 @@ class CellsResult:
                 "detection": [0.0] * grid.size(Stage.detection),
                 "estimation": [0.0] * grid.size(Stage.detection, Stage.estimation),
             },
-            np.zeros(count),
         )
-
-
-def concatenate(parts: Sequence[CellsResult]) -> CellsResult:
-    """Return the results of several groups of scenes as one group's results."""
-    starts = np.cumsum([0, *(len(part.row_seconds) for part in parts)]).tolist()
-    columns, seconds = parts[0].columns, parts[0].seconds
-    return CellsResult(
-        {name: np.concatenate([part.columns[name] for part in parts], axis=1) for name in columns},
-        {stage: np.sum([part.seconds[stage] for part in parts], axis=0).tolist()
-         for stage in seconds},
-        np.concatenate([part.row_seconds for part in parts]),
-        [
-            dataclasses.replace(failure, scene=failure.scene + start)
-            for start, part in zip(starts, parts, strict=False) for failure in part.failures
-        ],
-    )
 
 
 def to_dataset_layout(

@@ -29,7 +29,7 @@ from sweep.model.exposure import hidden, marker_boxes, not_modelled, outside_fra
 from sweep.model.renderers import render_all
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plugins import Poses
-from sweep.typing import Floats, Grey, Integers, Masks
+from sweep.typing import Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
 # Scenes that are in memory together.
@@ -224,8 +224,8 @@ def common_windows(windows: Sequence[Integers]) -> Integers:
 
 def detections_of(
     batch: SceneBatch, wanted: Masks, failures: list[Failure], *, keep: bool = False
-) -> tuple[list[SearchResult], Floats]:
-    """Render each scene once and search it with each detector setting.
+) -> list[SearchResult]:
+    """Render each scene once and search it with each detector setting; return a result for each.
 
     Parameters
     ----------
@@ -237,34 +237,23 @@ def detections_of(
         The exceptions of single scenes are appended.
     keep
         Whether the results keep the images.
-
-    Returns
-    -------
-    results : list of SearchResult
-        One for each setting.
-    row_s : ndarray
-        (N,) seconds spent on rendering and searching each scene.
     """
     sources, windows = detection_sources(batch), searched_windows(batch)
     rendered = common_windows(windows)
     passes = [
-        _Pass(source, k, cut, rendered, keep, failures, np.zeros(len(batch.scenes)))
+        _Pass(source, k, cut, rendered, keep, failures)
         for k, (source, cut) in enumerate(zip(sources, windows, strict=True))
     ]
     imaged = wanted & np.array([keep or source.needs_images for source in sources])
-    row_s = np.zeros(len(batch.scenes))
     for rows in _groups(np.flatnonzero(imaged.any(axis=1)), rendered, batch.scenes):
-        begun = time.perf_counter()
         images = images_of(render_all, batch, rows, rendered, failures)
-        row_s[rows] = (time.perf_counter() - begun) / len(rows)
         for each in passes:
             some = np.flatnonzero(imaged[rows, each.number])
             each.search(rows[some], [images[i] for i in some.tolist()])
     for each in passes:
         unseen = np.flatnonzero(wanted[:, each.number] & ~imaged[:, each.number])
         each.search(unseen, [_UNSEEN] * len(unseen))
-    row_s += np.sum([each.row_s for each in passes], axis=0)
-    return [each.result(batch.targets) for each in passes], row_s
+    return [each.result(batch.targets) for each in passes]
 
 
 #: The image of a scene that is not rendered, since no source needs it.
@@ -275,7 +264,7 @@ _UNSEEN = np.empty((0, 0), dtype=np.uint8)
 class _Pass:
     """The search by one source: its windows (N, 4), those that are rendered, its outputs by row.
 
-    ``row_s`` (N,) are the seconds spent on each scene, ``failed`` the rows that raised.
+    ``seconds`` are spent on all scenes so far, ``failed`` are the rows that raised.
     """
 
     source: DetectionSource
@@ -284,7 +273,7 @@ class _Pass:
     rendered: Integers
     keep: bool
     failures: list[Failure]
-    row_s: Floats
+    seconds: float = 0.0
     outputs: dict[int, SearchOutput] = field(default_factory=dict)
     images: dict[int, Grey] = field(default_factory=dict)
     failed: list[int] = field(default_factory=list)
@@ -310,7 +299,7 @@ class _Pass:
                     raise_machine_fault(error)
                 note_failure(self.failures, row, "detection", self.number)
                 self.failed.append(row)
-            self.row_s[row] = time.perf_counter() - begun
+            self.seconds += time.perf_counter() - begun
 
     def result(self, targets: TargetScenes) -> SearchResult:
         """Return the markers that were found in the windows."""
@@ -320,7 +309,7 @@ class _Pass:
         flags = found.flags.copy()
         flags[self.failed] = DetectionStatus.failed
         poses = self.source.poses(found)
-        seconds = float(self.row_s.sum()) + time.perf_counter() - begun
+        seconds = self.seconds + time.perf_counter() - begun
         return SearchResult(
             targets, found, flags, seconds, self.images, first, poses, self.outputs, origins)
 
@@ -334,7 +323,7 @@ def _groups(
 ) -> Iterator[NDArray[np.intp]]:
     """Cut rows into runs whose windows have about ``GROUP_PX`` pixels, at least one each.
 
-    A scene that is not plain is rendered alone, so that its time is its own.
+    A scene that is not plain is rendered alone.
     """
     if not len(rows):
         return

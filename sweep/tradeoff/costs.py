@@ -351,7 +351,7 @@ def _searched(
     if len(rows) < len(batch.scenes):
         batch = search.scenes_at(pipeline.experiment, [index[rows] for index in indices])
     wanted = np.full((len(rows), len(pipeline.experiment.detectors)), len(visible) > 0)
-    return batch, search.detections_of(batch, wanted, [], keep=True)[0]
+    return batch, search.detections_of(batch, wanted, [], keep=True)
 
 
 # --------------------------------------------------------------------------------------------------

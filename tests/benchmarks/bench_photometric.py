@@ -73,7 +73,7 @@ def measured(side, tilt):
     state = state_of(scenes.rotation[0], scenes.translation[0], 0.0, scenes.levels[0])
     width, height = (box[2:] - box[:2]).tolist()
     image = np.zeros((height, width))
-    found, _ = detections_of(batch, np.ones((SCENES, 1), dtype=bool), [], keep=True)
+    found = detections_of(batch, np.ones((SCENES, 1), dtype=bool), [], keep=True)
     rows = np.flatnonzero(found[0].flags == DetectionStatus.detected)
     seen = detections_for(pipeline.experiment.estimators[0], batch, found[0], rows)
     return (

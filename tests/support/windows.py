@@ -67,6 +67,6 @@ def searched(scenes, setting, *, full=False):
     values = {"window": Column.of(windows), "background": Column.of(0.0)}
     targets = target_scenes(scenes, flags)
     batch = SceneBatch(experiment, [], values, scenes, flags, targets, marker_boxes(scenes))
-    (result,), _ = detections_of(batch, np.ones((count, 1), dtype=bool), failures, keep=False)
+    (result,) = detections_of(batch, np.ones((count, 1), dtype=bool), failures, keep=False)
     assert not failures
     return result

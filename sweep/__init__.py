@@ -304,12 +304,11 @@ def twins(
     >>> simulated.true_tvec_m.shape  # photographs, markers, and x, y, z in metres
     (3, 10, 3)
     """
-    named = "twins" if isinstance(scene, Mapping) else scene
+    named = "twins" if isinstance(scene, Mapping) else path_of("scene", scene)
     measured = library.lifecycle.read_pipeline(photographs)
-    parameters = (
-        scene if isinstance(scene, Mapping) else library.prepare.read_scene(scene, measured))
+    section = scene if isinstance(scene, Mapping) else library.prepare.read_scene(named, measured)
     return run(
-        library.prepare.twin_pipeline(measured, parameters, repeats),
+        library.prepare.twin_pipeline(measured, section, repeats),
         store=store or library.prepare.twin_store(photographs, named), progress=progress, **options)
 
 

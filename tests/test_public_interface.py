@@ -117,6 +117,20 @@ def test_arguments_that_cannot_be_are_value_errors_that_name_them(options, expec
     assert not (tmp_path / "none.zarr").exists()
 
 
+@pytest.mark.parametrize(("function", "arguments", "expected"), [
+    (sweep.limit, {"pipeline": FEW, "require": 3}, "require = 3: expected texts"),
+    (sweep.limit, {"pipeline": FEW, "at_all": b"x"}, "at_all = b'x': expected texts"),
+    (sweep.limit, {"pipeline": FEW, "settings": 3}, "settings = 3: expected texts"),
+    (sweep.limit, {"pipeline": FEW, "max_trials": b"x"}, "max_trials = b'x': expected at least 1"),
+    (sweep.fit, {"markers": "x"}, "markers = x: expected a whole number from 1 to 1000"),
+])
+def test_answers_refuse_other_types_by_name(function, arguments, expected):
+    with pytest.raises(ArgumentError, match=re.escape(expected)):
+        function(**arguments)
+    with pytest.raises(ArgumentError, match=re.escape("names = []: expected camera")):
+        sweep.reference([])
+
+
 def test_every_module_that_mypy_sees_in_the_library_is_imported_on_use():
     tree = ast.parse(Path(library.__file__).read_text(encoding="utf-8"))
     seen = {

@@ -69,7 +69,8 @@ def trial_pipeline(
     reflected[["bearing_x_deg", "bearing_y_deg"]] *= -1
     steep = drawn.assign(tilt_deg=rng.uniform(80.0, 85.0, half))
     scenes = pd.concat([drawn, reflected, steep, pd.DataFrame(ODD)]).fillna(0).round(6)
-    scenes = scenes.drop(columns=[each.partition("=")[0] for each in settings], errors="ignore")
+    names = [each.partition("=")[0].rpartition(".")[2].strip() for each in settings]
+    scenes = scenes.drop(columns=names, errors="ignore")
     document: dict[str, Any] = {
         "title": "Conformance", "camera": {"fx_px": 600.0, "fy_px": 600.0},
         "marker": {"dictionary": dictionary}, "scene": {"window": "full"},

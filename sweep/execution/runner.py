@@ -9,7 +9,6 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
@@ -358,7 +357,8 @@ def limit(
     Parameters
     ----------
     pipeline
-        As `sweep.run` takes it; a store of equally many trials everywhere is analysed as it is.
+        As `sweep.run` takes it; a store of equally many trials everywhere is analysed as it is,
+        unless settings or max_trials are given.
     require
         What must hold, such as "detection >= 0.9", all together (default: those of the
         pipeline's section [require]).
@@ -399,33 +399,35 @@ def limit(
     """
     from sweep.analysis.requirements import requirement_limits  # noqa: PLC0415  (slow to import)
 
-    chosen = search_settings(require, along, per, at_all, max_trials)
+    errors.check_positive("max_trials", max_trials, "expected at least 1", whole=True)
+    chosen = [*errors.texts_of("settings", settings),
+              *search_settings(require, along, per, at_all, max_trials)]
     if isinstance(pipeline, (str, os.PathLike)) and lifecycle.names_store(pipeline):
         stored = lifecycle.open_store(os.fspath(pipeline))
-        if stored.pipeline.stopping is None and stored.pipeline.axis("trial") is not None:
+        stopped, trials = stored.pipeline.stopping is not None, stored.pipeline.axis(TRIAL)
+        if trials is not None and not (stopped or settings or max_trials):
             lifecycle.open_finished(stored.url)
             results = lifecycle.open_dataset(os.fspath(pipeline))
             limits = requirement_limits(results, require, along, per, at_all)
             return limits.assign_attrs(store=os.fspath(pipeline))
-        if store is None and not settings:
+        if store is None and stopped and not settings:
             store = pipeline
     try:
-        read = lifecycle.read_pipeline(pipeline, [*settings, *chosen])
+        read = lifecycle.read_pipeline(pipeline, chosen)
     except errors.PipelineError as error:
         if NO_TRIALS not in str(error):
             raise
         chosen += search_settings(max_trials=MAX_TRIALS)
-        read = lifecycle.read_pipeline(pipeline, [*settings, *chosen])
+        read = lifecycle.read_pipeline(pipeline, chosen)
     searched = getattr(read.stopping, "along", "")
     if not searched:
         names = [axis.name for axis in read.axes_of(Stage.scene)
                  if axis.is_numeric and axis.name != TRIAL]
         raise errors.ArgumentError(
             "along", along, f"expected one of {', '.join(names) or 'its axes'}")
-    if store is None:
-        store = Path("runs") / f"{read.name}-limit-{searched}.zarr"
+    own = f"runs/{read.name}-limit-{searched}.zarr"
     with progress_report(progress) as report:
-        summary = execute(read, store, progress=report, **options)
+        summary = execute(read, own if store is None else store, progress=report, **options)
     for line in summary.warnings:
         notice(line)
     limits = requirement_limits(lifecycle.open_dataset(summary.store))

@@ -13,6 +13,7 @@ from typing import Any
 
 from sweep import experiment
 from sweep.declaration import Declared, TablesError, check_table
+from sweep.errors import texts_of
 from sweep.experiment.document import REQUIRE, SEARCH, Reading, toml_item
 from sweep.experiment.draws import SAMPLINGS
 from sweep.experiment.grid import TRIAL, Axis, trial_numbers
@@ -467,10 +468,11 @@ def search_settings(
     >>> search_settings(["detection >= 0.9"], "distance_m", max_trials=600)
     ['require.all=["detection >= 0.9"]', 'search.along="distance_m"', 'search.max_trials=600']
     """
-    lists = {f"{REQUIRE}.all": require or None, f"{SEARCH}.along": None, f"{SEARCH}.per": per,
-             f"{REQUIRE}.per": at_all}
     given: dict[str, Any] = {
-        key: [texts] if isinstance(texts, str) else texts for key, texts in lists.items()}
-    given |= {f"{SEARCH}.along": along or None, f"{SEARCH}.{MAX_TRIALS}": max_trials}
+        f"{REQUIRE}.all": texts_of("require", require or ()) or None,
+        f"{SEARCH}.along": str(along) if along else None,
+        f"{SEARCH}.per": None if per is None else texts_of("per", per),
+        f"{REQUIRE}.per": None if at_all is None else texts_of("at_all", at_all),
+        f"{SEARCH}.{MAX_TRIALS}": max_trials}
     return [f"{key}={toml_item(value).as_string()}"
             for key, value in given.items() if value is not None]

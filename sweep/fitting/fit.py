@@ -952,7 +952,7 @@ def fit(
     >>> round(found.found.scene["blur_px"], 1)
     0.6
     """
-    if not 1 <= markers <= 1000:
+    if markers not in range(1, 1001):
         raise ArgumentError("markers", markers, "expected a whole number from 1 to 1000")
     if all(prepare.setting_name(each) in OF_MARKERS for each in settings):
         settings = [*settings, COMPARED]

@@ -45,7 +45,7 @@ def reference(*names: str) -> Findings:
     >>> sweep.reference("tilt_deg").numbers["parameters"][0]["unit"]
     'degree'
     """
-    chosen = [name for name in names if name not in TABLES]
+    chosen = [name for name in map(str, names) if name not in TABLES]
     for name in chosen:
         if name not in PARAMETERS:
             raise ArgumentError("names", name, f"expected {', '.join(TABLES)}, or a parameter"

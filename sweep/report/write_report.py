@@ -20,7 +20,7 @@ from sweep.analysis.dataset import of_photographs, sampling_text
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import BOARDS, Decision, Reached, Verdict, requirement_limits
 from sweep.analysis.summaries import ThresholdChoice
-from sweep.errors import ArgumentError, DatasetError, StoreError, path_of
+from sweep.errors import ArgumentError, DatasetError, StoreError, path_of, texts_of
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import BoundStatus, Flag, outcomes, present_values
 from sweep.messages import quoted
@@ -567,7 +567,7 @@ def write_report(
     folders = [folder for folder in (beside, Path(figures) if figures else None) if folder]
     data = report_data.read_report_data(path_of("store", store), require, per, command)
     if error_model:
-        findings.model_findings(data, error_model)
+        findings.model_findings(data, texts_of("error_model", error_model))
     output_file.check_output_file(file)
     for folder in folders:
         output_file.check_output_file(folder / "figure.png" if folder.is_dir() else folder)

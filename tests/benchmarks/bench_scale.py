@@ -83,12 +83,11 @@ def opened(url, run_id):  # noqa: ARG001  (a store of its own for each run)
     return open_store(url, "r+")
 
 
-def simulated_block(arguments):
+def simulated_block(url, run_id, block, _sources, time_limit_s, _decision):
     """Wait a block's time, here passed as its time limit; write its receipt and return it.
 
     It takes 0.5 to 1.5 of that: workers do not finish all at once.
     """
-    url, run_id, block, _, time_limit_s, _ = arguments
     begun, store = time.perf_counter(), opened(url, run_id)
     number = store.blocks.number(block)
     wanted = time_limit_s * (0.5 + number * 0.6180339887498949 % 1.0)

@@ -53,8 +53,8 @@ distance_m = [0.5, 0.6]
 
 SHOWN = {
     "analysis": ["tilt_deg", "distance_m"],
-    "answers": ["detection_rate_low", "rotation_p95_deg", "per_module", "p_adjusted"],
-    "tutorial": ["side_px_high", "subpix", "range_rmse_ratio_low"],
+    "answers": ["detection_rate_low", "rotation_p95_deg", "distance_m", "p_adjusted"],
+    "tutorial": ["tilt_deg", "subpix", "range_rmse_ratio_low"],
 }
 """What the block with a comment prints, among other things."""
 

@@ -11,12 +11,7 @@ from sweep.analysis.camera_calibration import calibration_summary, camera_calibr
 from sweep.analysis.comparisons import compare, renderer_bias, simulation_gap, store_differences
 from sweep.analysis.dataset import per_marker
 from sweep.analysis.error_models import error_models, model_covariance, model_errors
-from sweep.analysis.requirements import (
-    check_requirements,
-    detection_limit,
-    precision_reached,
-    requirement_limits,
-)
+from sweep.analysis.requirements import check_requirements, precision_reached, requirement_limits
 from sweep.analysis.summaries import (
     ambiguity,
     covariance_trust,
@@ -30,9 +25,8 @@ from sweep.analysis.summaries import (
 
 __all__ = [
     "ambiguity", "calibration_summary", "camera_calibrations", "check_requirements", "compare",
-    "covariance_trust", "detection_limit", "detection_rate", "efficiency",
-    "error_models", "error_statistics",
-    "failure_composition", "flip_rate", "marker_ranking", "model_covariance",
-    "model_errors", "per_marker", "precision_reached", "renderer_bias", "requirement_limits",
-    "simulation_gap", "store_differences",
+    "covariance_trust", "detection_rate", "efficiency", "error_models", "error_statistics",
+    "failure_composition", "flip_rate", "marker_ranking", "model_covariance", "model_errors",
+    "per_marker", "precision_reached", "renderer_bias", "requirement_limits", "simulation_gap",
+    "store_differences",
 ]

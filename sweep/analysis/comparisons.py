@@ -8,7 +8,7 @@ import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -336,9 +336,8 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     Returns
     -------
     xr.Dataset
-        Dimensions: renderer and the detector's settings; for the pose variables also
-        the estimator's. All others are pooled. The interval of
-        ``x`` is in ``x_low`` and ``x_high``.
+        Dimensions: renderer and the settings of detector and estimator. All others are pooled. The
+        interval of ``x`` is in ``x_low`` and ``x_high``.
 
         - ``detection_disagreement``: share of the poses looked for with both (``compared``) that
           are detected with one of them only (``differing``).
@@ -364,7 +363,7 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     --------
     >>> both = xr.concat([results, results], dim="renderer").assign_coords(
     ...     renderer=["exact", "area"])
-    >>> renderer_bias(both)["detection_disagreement"].values.tolist()
+    >>> renderer_bias(both)["detection_disagreement"].sel(solver="ippe").values.tolist()
     [0.0, 0.0]
     """
     dataset.kept_dimensions(results, ["renderer"])
@@ -372,14 +371,9 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     if reference not in renderers:
         raise ArgumentError("reference", reference, f"the renderers are {', '.join(renderers)}")
     others = results.isel(renderer=renderers.index(reference), drop=True)
-    scene = axes_of(results, Stage.scene)
-
-    def kept(name: str) -> list[str]:
-        return ["renderer", *(str(dim) for dim in results[name].dims if dim not in scene)]
-
     single, of_boards, _ = CORNER_VARIABLES
     corners, whose = of_boards if of_boards in results else single, "minus the reference's"
-    of_detections: list[PairStatistic] = [
+    statistics: list[PairStatistic] = [
         estimator.Rate("detection_disagreement", "differing of compared",
              lambda pair: pair.first.detected != pair.second.detected, lambda pair: pair.compared,
              counts=(("compared", "poses that were looked for with both renderers"),
@@ -387,8 +381,7 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
         estimator.RootMeanSquare(
             "corner_shift_rms_px", f"RMS of a corner's coordinate {whose}",
             lambda pair: _corner_shift(pair, corners),
-            lambda pair: pair.compared & pair.first.detected & pair.second.detected, units="px")]
-    of_poses: list[PairStatistic] = [
+            lambda pair: pair.compared & pair.first.detected & pair.second.detected, units="px"),
         Mean("range_bias_percent",
              f"mean depth error {whose}, of the true depth, both solved",
              lambda pair: _DEPTH.vector(pair.second) - _DEPTH.vector(pair.first),
@@ -400,12 +393,10 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
                 pair.second["rotation_error_rad"], pair.first["rotation_error_rad"],
                 dtype=np.float64)))[..., None],
             lambda pair: pair.first.unflipped & pair.second.unflipped, units=ROTATION.units)]
-    detections, = estimator.aggregates(
-        results, paired_arrays(others, results, *dataset.DETECTION_INPUTS, corners),
-        kept("detection"), [of_detections], Pair)
-    poses, = estimator.aggregates(
-        results, paired_arrays(others, results, *ERROR_INPUTS), kept("estimate"), [of_poses], Pair)
-    return detections.drop_vars("draws").assign(poses)
+    table, = estimator.aggregates(
+        results, paired_arrays(others, results, *ERROR_INPUTS, corners),
+        ["renderer", *dataset.configuration_axes(results)], [statistics], Pair)
+    return table.drop_vars("draws")
 
 
 def _corner_shift(pair: Pair, corners: str) -> Floats:
@@ -764,43 +755,13 @@ REPEAT = "repeat"
 SEED = 21
 
 
-class Sides(NamedTuple):
-    """Photographs and a simulation with the same configurations.
-
-    Attributes
-    ----------
-    datasets
-        Both; a trial is a photograph, or a scene of the simulation. Trials of the same index belong
-        together if they are ``paired``.
-    kept
-        Axes of the configurations.
-    bins
-        Edges of the bins, by name.
-    paired
-        Whether the simulation is the photographs' twin.
-    """
-
-    datasets: tuple[xr.Dataset, xr.Dataset]
-    kept: tuple[str, ...]
-    bins: Bins
-    paired: bool
-
-    def poses(self) -> list[Poses]:
-        """Return the poses within the bins of both, (configurations, 1, units, markers)."""
-        found = []
-        for side in self.datasets:
-            inside = xr.DataArray(True)
-            for name, edges in self.bins.items():
-                inside = inside & (side[name] >= edges[0]) & (side[name] < edges[-1])
-            inputs = dataset.pose_arrays(side, ERROR_INPUTS) | {dataset.INSIDE: inside}
-            found.append(Poses(estimator.arranged(side, inputs, self.kept, stopped=False)[0]))
-        return found
-
-
 def matched_sides(
     photographs: xr.Dataset, simulated: xr.Dataset, bins: Bins | None = None
-) -> Sides:
+) -> tuple[tuple[xr.Dataset, xr.Dataset], tuple[str, ...], Bins]:
     """Return photographs and a simulation at their common configurations.
+
+    A trial is a photograph, or a scene of the simulation; trials of a twin of the same index belong
+    to the same photograph. With them the axes of the configurations, and the edges of the bins.
 
     Raises
     ------
@@ -836,7 +797,7 @@ def matched_sides(
         second = second.drop_vars(DRAWS, errors="ignore").stack(
             unit=sorted(scene, key=lambda name: name != DRAWS), create_index=False)
         second = second.rename(unit=DRAWS).assign_coords({PHOTOGRAPHS: ""})
-    return Sides((first, second), kept, bins, paired)
+    return (first, second), kept, bins
 
 
 def is_measured(results: xr.Dataset) -> bool:
@@ -932,10 +893,11 @@ def _binned(results: xr.Dataset, name: str) -> xr.DataArray:
     """Return the binned quantity of a dataset: a variable, or one computed from others."""
     if name in results.variables and not dataset.is_fixed(results[name]):
         return results[name].reset_coords(drop=True)
+    distance = results["true_tvec_m"].isel(xyz=2, drop=True)
     if name == SIDE:
-        return dataset.image_sides(results)
+        return dataset.focal_size_of(results) / distance
     if name == "distance_m":
-        return results["true_tvec_m"].isel(xyz=2, drop=True)
+        return distance
     raise DatasetError(f"{name}: both datasets need it for bins; one has "
                        f"{', '.join(map(str, results.variables))}")
 
@@ -1093,10 +1055,11 @@ def simulation_gap(
     >>> gap["rotation_median_deg_gap"].values.tolist(), gap["solved"].values.tolist()
     ([1.0], [[13], [13]])
     """
-    sides = matched_sides(photographs, simulated, bins)
-    tables = [table for side in sides.datasets for table in estimator.aggregates(
-        side, dataset.pose_arrays(side, ERROR_INPUTS), sides.kept, [[*COUNTS, *GAP_STATISTICS]],
-        Poses, sides.bins, stopped=False)]
+    sides, kept, bins = matched_sides(photographs, simulated, bins)
+    paired = is_twin(simulated)
+    tables = [table for side in sides for table in estimator.aggregates(
+        side, dataset.pose_arrays(side, ERROR_INPUTS), kept, [[*COUNTS, *GAP_STATISTICS]],
+        Poses, bins, stopped=False)]
     first, second = (table.drop_vars([
         name for name, value in table.coords.items() if not value.dims]) for table in tables)
     gaps: dict[str, xr.DataArray] = {}
@@ -1107,11 +1070,11 @@ def simulation_gap(
         with np.errstate(divide="ignore", invalid="ignore"):
             gaps |= {output.name: array.assign_attrs(cf_attributes(output.meaning, output.units))
                      for output, array in zip(outputs, _gap(
-                         each, first, second, paired=sides.paired), strict=True)}
+                         each, first, second, paired=paired), strict=True)}
     both = xr.concat([first.drop_dims(UNIT), second.drop_dims(UNIT)], "source", coords="minimal",
                      compat="override", join="override")
     return both.assign(gaps).assign_coords(source=list(SOURCES)).assign_attrs(
-        paired=int(sides.paired))
+        paired=int(paired))
 
 
 def _gap(

@@ -303,13 +303,10 @@ def computed_scenes(results: xr.Dataset) -> xr.DataArray:
 
 
 # --------------------------------------------------------------------------------------------------
-# The side of the black square in pixels, over the axes that change it.
+# The size in the image.
 
 #: The usual axes along which the size in the image changes.
 SIZE_AXES = ("side_px", "distance_m")
-
-#: Parameters that determine the side: itself, or distance, size and camera.
-SIZE_PARAMETERS = ("side_px", "distance_m", "size_m", *VIEW_PARAMETERS)
 
 
 def focal_size_of(results: xr.Dataset) -> xr.DataArray:
@@ -330,41 +327,6 @@ def focal_size_of(results: xr.Dataset) -> xr.DataArray:
         fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
         product = xr.DataArray(fx) * values["size_m"]
     return product.astype(np.float64).reset_coords(drop=True)
-
-
-def image_sides(results: xr.Dataset) -> xr.DataArray:
-    """Return the sides as if the square were parallel to the image plane: fx · size / distance.
-
-    Parameters
-    ----------
-    results
-        The dataset of a run.
-
-    Returns
-    -------
-    xr.DataArray
-        Sides in pixels over the dimensions that change them.
-
-    Raises
-    ------
-    DatasetError
-        If they cannot be computed, or are drawn.
-    """
-    by_side = "side_px" in results.coords
-    for name in SIZE_PARAMETERS:
-        if name in results.coords and DRAWS in results[name].dims and not (
-                by_side and name == "distance_m"):
-            raise DatasetError(f"{name}: is drawn, so that the side is no number of the grid")
-    if by_side:
-        sides = results["side_px"]
-    elif (distance := parameter_value(results, "distance_m")) is None:
-        raise DatasetError(
-            "distance_m: is no number of this store, whose poses are given in the world; a "
-            "limit needs an axis distance_m or side_px (per= takes any axis for rates)")
-    else:
-        sides = focal_size_of(results) / distance
-    return sides.astype(np.float64).drop_vars(
-        [name for name, each in sides.coords.items() if is_fixed(each)])
 
 
 # --------------------------------------------------------------------------------------------------

@@ -37,7 +37,6 @@ from sweep.experiment.sampling import RequirementText, StoppingRule, read_requir
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
 from sweep.messages import label, nearest, plain, shown
-from sweep.model.marker import module_count
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -272,9 +271,9 @@ class Decision(Flag):
 
 
 def combined_decision(
-    decision: NDArray[np.uint8], axis: int | tuple[int, ...]
+    decision: NDArray[np.uint8], axis: int | tuple[int, ...] | None = None
 ) -> NDArray[np.uint8]:
-    """Return the decision of all requirements and conditions over some axes together.
+    """Return the decision of all requirements and conditions over some axes together, or over all.
 
     Not met if any is not, met if all are that can be judged: not applicable ones are left out.
     Not applicable if none can be judged.
@@ -746,14 +745,6 @@ def verdicts(table: xr.Dataset) -> list[Verdict]:
     return found
 
 
-def combined(found: Iterable[Verdict]) -> Decision:
-    """Return the decision of all verdicts together; without anything to judge it is undecided."""
-    decisions = {verdict.decision for verdict in found}
-    if Decision.not_met in decisions:
-        return Decision.not_met
-    return Decision.undecided if decisions - {Decision.met} else Decision.met
-
-
 def excess_of(table: xr.Dataset) -> xr.DataArray:
     """Return how far the values of a table are beyond the limits, relative to these.
 
@@ -1167,97 +1158,6 @@ def kept_from(keeps: Masks, judged: Masks) -> int | None:
     runs = edges.reshape(-1, 2)
     longest = 0 if runs[0, 0] == 0 else int(np.argmax(runs[:, 1] - runs[:, 0]))
     return int(at[runs[longest, 0]])
-
-
-@describes
-def detection_limit(
-    results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None
-) -> xr.Dataset:
-    """Return the smallest side of the black square from which on the marker is detected.
-
-    Parameters
-    ----------
-    results
-        The dataset of a run with an axis that changes the size in the image: ``side_px``,
-        ``distance_m``, ``size_m``, or one of the camera. What is no coordinate is read from the
-        pipeline in its attributes.
-    rate
-        The detection rate that is asked for, above 0 and below 1.
-    per
-        Dimensions that are kept; by default the tilt or viewing angle, if it varies. A dimension
-        ``dictionary`` is always kept, the axis of the size and the trials cannot be. Others are
-        pooled.
-
-    Returns
-    -------
-    xr.Dataset
-        Dimensions (*detector settings, *per): `requirement_limits` of ``detection >= rate``, as
-        sides.
-
-        - ``side_px``: side in pixels, if the square were parallel to the image, down to which the
-          rate is reached without a gap; infinite for never. Its interval is in ``side_px_low`` and
-          ``side_px_high``: 0 or infinite, the limit may lie beyond the grid.
-        - ``side_px_per_module``: the same per module of the marker, with its interval.
-        - the axis, such as ``distance_m``: its value there, with its interval in
-          ``distance_m_low`` and ``distance_m_high``.
-        - ``reach``: whether the rate is reached within the grid (`Reach`).
-
-    Raises
-    ------
-    ArgumentError
-        For a rate outside (0, 1), and for ``per`` that cannot be kept, or leaves none or several
-        axes of the size.
-    DatasetError
-        If the size is drawn; if the dataset lacks variables of results, has
-        no poses, or a single draw of each.
-
-    Notes
-    -----
-    The interval is computed by `requirement_limits`, for each condition by itself.
-
-    Examples
-    --------
-    >>> limit = detection_limit(results, rate=0.6)
-    >>> limit["side_px"].item(), limit["side_px_high"].item(), Reach(limit["reach"].item()).name
-    (20.0, 40.0, 'found')
-    """
-    dataset.require_poses(results)
-    axes = axes_of(results)
-    results = results.isel(  # what has several estimators has been detected once
-        {name: 0 for name in axes if name not in results["detection"].dims}, drop=True)
-    if per is None:
-        per = [name for name in ANGLE_AXES if name in axes]
-    per = dataset.kept_dimensions(results, (*as_names(per), *{"dictionary"}.intersection(axes)))
-    sides = dataset.image_sides(results)
-    searched = [str(dim) for dim in sides.dims if dim not in per]
-    if len(searched) != 1:
-        of_size = ", ".join(map(str, sides.dims)) or "none"
-        raise ArgumentError("per", ", ".join(per), "expected all axes of the size but one, which "
-                            f"the limit is along; there are {of_size}")
-    along, = searched
-    found = requirement_limits(results, [f"detection >= {rate:.12g}"], along, per)
-    modules = xr.apply_ufunc(
-        np.vectorize(module_count), xr.DataArray(dataset.parameter_value(results, "dictionary")))
-    smaller = found.attrs["harder"] == "upwards"
-    out = {"reach": found["reach"]}
-    for end, words in INTERVAL.items():
-        # Where the axis makes markers small as it grows, ends of sides are the other ends.
-        other = {"_low": "_high", "_high": "_low"}.get(end, end) if smaller else end
-        at = found[other[1:] or "value"].fillna(-np.inf if smaller else np.inf)
-        # Beyond the grid's end at which markers are small the side is 0, beyond the other infinite.
-        beyond = at.copy(data=np.where((at > 0) == smaller, 0.0, np.inf))
-        side = sides.sel({along: at.where(np.isfinite(at), sides[along][0])}).where(
-            np.isfinite(at), beyond).where(found["reach"] != Reach.not_run)
-        meaning = f"{words}smallest side from which on the detection rate is at least {rate:g}"
-        out |= {
-            f"side_px{end}": side.assign_attrs(long_name=meaning, units="px"),
-            f"side_px_per_module{end}": (side / modules).assign_attrs(
-                long_name=f"{meaning}, per module", units="px")}
-        if along != "side_px":
-            out[f"{along}{end}"] = found[end[1:] or "value"]
-    # Others along the axis, such as the distance of a side, do not belong to the answer.
-    return xr.Dataset({name: each.drop_vars(along, errors="ignore").reset_coords(drop=True)
-                       for name, each in out.items()})
 
 
 # --------------------------------------------------------------------------------------------------

@@ -116,8 +116,10 @@ def require(
     found = [] if table is None else judged.verdicts(table)
     worse = [] if against is None else comparisons.regressions(
         selected_store(against, at)[0], results, [each.what.name for each in required], axes)
-    decision = Decision.not_met if any(each.worse for each in worse) else (
-        judged.combined(found) if found else Decision.met)
+    decision = Decision.met if table is None else Decision(int(
+        judged.combined_decision(table["decision"].to_numpy())))
+    if any(each.worse for each in worse):
+        decision = Decision.not_met
     named = {*axes, dataset.DRAWS, *dataset.configuration_axes(results)}
     pooled = [name for name in dataset.axes_of(results)
               if name not in named and results.sizes[name] > 1]

@@ -422,7 +422,8 @@ def required(
     table = judged.check_requirements(results, data.require, data.per)
     places = [{name: [k] for name, k in at.items()} for at in known.combinations]
     found = [judged.verdicts(table.isel(at)) for at in places]
-    combined = [judged.combined(each) for each in found]
+    combined = [Decision(int(judged.combined_decision(table["decision"].isel(at).to_numpy())))
+                for at in places]
     along, others = report_data.course_of(data)
     # At all other conditions together, and at each of them.
     courses = [((), others), *([(others, ())] if others else [])] if along else []

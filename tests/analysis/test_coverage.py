@@ -13,7 +13,7 @@ from scipy import stats
 
 from support.lengths import lengths
 from support.small_datasets import holm, perfect, with_detected
-from sweep.analysis import compare, detection_limit, error_statistics, marker_ranking
+from sweep.analysis import compare, error_statistics, marker_ranking, requirement_limits
 from sweep.measure.flags import Flipped
 
 
@@ -173,10 +173,10 @@ def test_limits_of_detection_are_covered_at_least_as_often_as_they_say(
     results = perfect(rng, sizes)
     sides = results["side_px"].values
     results = with_detected(results, rng.random(tuple(sizes.values())) < rates[:, None])
-    answer = detection_limit(results, 0.9, per=["regime"]).compute()
+    answer = requirement_limits(results, ["detection >= 0.9"], "side_px", per=["regime"])
     good = np.minimum.accumulate((rates >= 0.9)[::-1])[::-1]
     truth = sides[good][0] if good.any() else math.inf  # beyond the grid
-    covered(answer, "side_px", truth, 0.95, 1.0)
+    covered(answer.rename(low="side_px_low", high="side_px_high"), "side_px", truth, 0.95, 1.0)
 
 
 @lengths(60, 2000)

@@ -10,7 +10,7 @@ from sweep.analysis.requirements import (
     Decision,
     Reach,
     check_requirements,
-    combined,
+    combined_decision,
     parse_requirements,
     requirement_limits,
     verdicts,
@@ -111,6 +111,19 @@ def test_a_limit_beyond_the_grid_has_an_infinite_end(axis, met, ends):
     assert Reach(int(one["reach"])) is (Reach.always if met else Reach.never)
 
 
+@pytest.mark.parametrize(("axis", "harder"), [
+    ("side_px", "downwards"), ("size_m", "downwards"), ("fx_px", "downwards"),
+    ("focal_length_mm", "downwards"), ("hfov_deg", "upwards"), ("pixel_size_um", "upwards")])
+def test_a_limit_is_read_towards_smaller_markers(axis, harder):
+    rates = [0.5, 0.5, 1.0, 1.0][::-1 if harder == "upwards" else 1]
+    results = detected_by_distance(rates).rename(distance_m=axis)
+    one = requirement_limits(results, ["detection >= 0.9"], axis).isel(solver=0)
+    assert one.attrs["harder"] == harder
+    assert float(one["value"]) == (2.0 if harder == "upwards" else 3.0)
+    assert Reach(int(one["reach"])) is Reach.found
+    assert float(one["low"]) <= float(one["value"]) <= float(one["high"])
+
+
 @pytest.mark.parametrize("parts", [2, 0])
 def test_an_axis_with_repeated_values_or_without_any_has_no_limit(parts):
     results = detected_by_distance([1.0, 1.0])
@@ -123,7 +136,8 @@ def test_verdicts_are_of_the_worst_condition():
     table = check_requirements(detected_by_distance([1.0, 0.97, 0.2]), ["detection >= 0.9"],
                                per=["distance_m"])
     (verdict,) = verdicts(table)
-    assert verdict.decision is Decision.not_met is combined([verdict])
+    assert verdict.decision is Decision.not_met is Decision(
+        int(combined_decision(table["decision"].to_numpy())))
     assert verdict.condition == {"distance_m": 3.0}
     assert verdict.value == pytest.approx(0.2)
     assert verdict.counts == {Decision.met: 2, Decision.not_met: 1}

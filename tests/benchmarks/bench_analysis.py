@@ -57,7 +57,7 @@ CALLS = {
     "ambiguity": "ambiguity(results, ('tilt_deg', 'side_px'))",
     "marker_ranking": "marker_ranking(results)",
     "compare": "compare(results.isel(solver=0), results.isel(solver=1), ('tilt_deg',))",
-    "detection_limit": "detection_limit(results, 0.9)",
+    "requirement_limits": "requirement_limits(results, ['detection >= 0.9'], 'side_px')",
 }
 
 QUICK = {"POSES": 10**4, "CALLS": dict(list(CALLS.items())[:2])}
@@ -66,8 +66,8 @@ CHILD = """
 import json, sys, time
 import numpy as np
 import xarray as xr
-from sweep.analysis import (ambiguity, compare, detection_limit, detection_rate, error_statistics,
-                            failure_composition, flip_rate, marker_ranking)
+from sweep.analysis import (ambiguity, compare, detection_rate, error_statistics,
+                            failure_composition, flip_rate, marker_ranking, requirement_limits)
 AREAS = np.geomspace(100, 40_000, 13)
 begun = time.perf_counter()
 results = xr.open_zarr(sys.argv[1], consolidated=False)  # no block has a receipt

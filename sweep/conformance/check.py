@@ -16,7 +16,7 @@ from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import Failure
 from sweep.evaluation.search import detections_of, scenes_at
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Child, ChildDiedError, ChildError
+from sweep.isolation.child_process import Child, ChildError
 from sweep.measure.detectors import FITS, OPENCV, PluginSetting, fitting_order
 from sweep.measure.estimation import Estimates, pose_error
 from sweep.measure.estimators import SOLVERS, build
@@ -346,8 +346,7 @@ def check_plugin(
                 findings[check] = child.call(
                     _next, number, plugin.kind, pipeline, limit_s=time_limit_s)
             except (ChildError, PluginError) as error:
-                ended = "the call ended by " if isinstance(error, ChildDiedError) else ""
-                findings[check] = Finding(FAULT, ended + getattr(error, "line", str(error)))
+                findings[check] = Finding(FAULT, getattr(error, "line", str(error)))
                 break
     report = pd.DataFrame(
         [(check, *found[:2]) for check, found in findings.items()],

@@ -194,7 +194,7 @@ EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
     **dict.fromkeys(("make", "apply", "render"), (callable, "a class or function")),
     "distribution": (lambda names: isinstance(names, str | Sequence), "a name, or several"),
     "families": (lambda names: isinstance(names, Mapping | None), "names by dictionary, or None"),
-    "pixel_center": (lambda center: -1 <= center <= 1, "0 or 0.5"),
+    "pixel_center": (lambda at: isinstance(at, float | int) and -1 <= at <= 1, "0 or 0.5"),
     "corner_order": (lambda order: sorted(order) == [0, 1, 2, 3], "the numbers 0 to 3, each once"),
     "step": (lambda step: step in ("light", "signal"), "light or signal"),
     "widens": (lambda widens: widens in get_args(Widens), "nothing, noise or uneven light"),

@@ -383,7 +383,7 @@ def load(kind: str, name: str, folder: str) -> tuple[Plugin, str, Versions]:
     if not isinstance(found, record):
         raise PluginError(f"a record {record.__name__}, not a value of type {type(found).__name__}")
     needed = found.distribution
-    for distribution in (needed,) if isinstance(needed, str) else needed:
+    for distribution in (needed,) * bool(needed) if isinstance(needed, str) else needed:
         try:
             versions[distribution] = importlib.metadata.version(distribution)
         except Exception:  # also of what is no name

@@ -59,6 +59,7 @@ class Turned:  # OpenCV's own search, with other conventions
 
 TURNED = DetectorPlugin(
     make=Turned, settings=Settings, pixel_center=0.5, corner_order=(2, 3, 0, 1), margin_px=16,
+    distribution="",
 )
 """
 
@@ -359,6 +360,8 @@ def test_what_a_function_margin_px_raises_is_the_plug_in_s_fault(bad):
      "the distribution 3, which is not installed"),
     ("from sweep.plugins import *\nD = DetectorPlugin(make=print, distribution='not-there-9')",
      "the distribution not-there-9, which is not installed: `pip install not-there-9`"),
+    ("from sweep.plugins import *\nD = DetectorPlugin(make=print, pixel_center='half')",
+     "ValueError: pixel_center = 'half': expected 0 or 0.5 (line 2 of mine.py)"),
     (MINE.replace("shift_px", "tilt_deg").replace("TURNED", "D"),
      "another name for its setting tilt_deg: the pipeline has this one"),
 ])

@@ -421,41 +421,15 @@ def _corner_shift(pair: Pair, corners: str) -> Floats:
 MARGIN = 0.01
 
 
-@dataclass(frozen=True)
-class Regression:
-    """A comparison at one configuration: the condition at which it is worst.
-
-    Attributes
-    ----------
-    quantity
-        "detection_rate", or a kind of error: the mean of its absolute value.
-    configuration, condition
-        Values by axis.
-    difference, low, high
-        New minus old with its interval, at a level for all comparisons together (Bonferroni).
-    units
-        Of these.
-    worse
-        Whether it is significantly worse at any condition.
-    """
-
-    quantity: str
-    configuration: Mapping[str, Any]
-    condition: Mapping[str, Any]
-    difference: float
-    low: float
-    high: float
-    units: str
-    worse: bool
-
-
-def _first_error(quantity: Quantity, pair: Pair) -> Floats:
-    return quantity.norm(pair.first)[..., None]
+def _first_error(quantity: Quantity) -> PairStatistic:
+    """Return the mean error of the first of the poses that both solved."""
+    return Mean(quantity.named("first"), "", lambda pair: quantity.norm(pair.first)[..., None],
+                lambda pair: pair.both_solved)
 
 
 def regressions(
     old: xr.Dataset, new: xr.Dataset, variables: Iterable[str] = (), per: Sequence[str] = (),
-) -> list[Regression]:
+) -> list[dict[str, Any]]:
     """Return how the detection rate and the errors that ``variables`` are of have changed.
 
     Parameters
@@ -469,8 +443,12 @@ def regressions(
 
     Returns
     -------
-    list of Regression
-        The detection rate and each kind of error, for each configuration the worst condition.
+    list of dict
+        The detection rate and each kind of error, for each configuration the worst condition:
+        ``quantity``, "detection_rate" or a mean error in words; ``configuration`` and ``condition``
+        (values by axis); ``difference``, new minus old, with its interval ``low`` to ``high`` at a
+        level for all comparisons together (Bonferroni), in ``units``; ``worse``: whether it is
+        significantly worse at any condition.
         The rate is worse if McNemar's exact test says so. An error is, if the lower end of the
         interval of its paired mean difference, on the poses that both solved, lies above `MARGIN`
         of the old mean. False "worse" of any has a probability below 0.05.
@@ -487,10 +465,8 @@ def regressions(
     kept = dataset.kept_dimensions(new, (*configuration, *dataset.as_names(per)))
     count = math.prod(new.sizes[name] for name in kept) * (1 + len(quantities))
     level = 1.0 - (1.0 - LEVEL) / count
-    means: list[PairStatistic] = [
-        Mean(each.named("first"), "", functools.partial(_first_error, each),
-             lambda pair: pair.both_solved) for each in quantities]
-    table, = paired_tables(old, new, kept, None, quantities, [level], means)
+    table, = paired_tables(
+        old, new, kept, None, quantities, [level], [*map(_first_error, quantities)])
     if int(table["different_scenes"].sum()):
         raise DatasetError("the scenes of the two stores differ, so that nothing can be paired; "
                            "compare stores of one pipeline")
@@ -511,9 +487,11 @@ def regressions(
         for at, one in dataset.each_cell(columns, configuration):
             cell = dataset.largest_cell(one, one["excess"].transpose(*conditions))
             difference, low, high = (float(cell[f"{name}{end}"]) for end in INTERVAL)
-            found.append(Regression(
-                quantity, at, {dim: cell[dim].item() for dim in conditions},
-                difference, low, high, units, bool(one["worse"].any())))
+            found.append({
+                "quantity": quantity, "configuration": at,
+                "condition": {dim: cell[dim].item() for dim in conditions},
+                "difference": difference, "low": low, "high": high, "units": units,
+                "worse": bool(one["worse"].any())})
     return found
 
 
@@ -718,12 +696,10 @@ def _parameters(results: xr.Dataset) -> dict[str, Any]:
     def content(value: Any) -> Any:
         return pipeline.files.get(value, value) if isinstance(value, str) else value
 
-    listed = {
-        name: tuple(map(content, values))
-        for axis in pipeline.axes for name, values in axis.columns.items()
-    }
-    fixed = {name: content(value) for name, value in pipeline.fixed.items()}
-    return {**fixed, **pipeline.distributions, **listed}
+    listed = {name: tuple(map(content, values))
+              for axis in pipeline.axes for name, values in axis.columns.items()}
+    values = pipeline.fixed | pipeline.distributions | listed
+    return {name: content(value) for name, value in values.items()}
 
 
 def _changes(
@@ -753,51 +729,6 @@ TRUTH_STD = "truth_std"
 REPEAT = "repeat"
 
 SEED = 21
-
-
-def matched_sides(
-    photographs: xr.Dataset, simulated: xr.Dataset, bins: Bins | None = None
-) -> tuple[tuple[xr.Dataset, xr.Dataset], tuple[str, ...], Bins]:
-    """Return photographs and a simulation at their common configurations.
-
-    A trial is a photograph, or a scene of the simulation; trials of a twin of the same index belong
-    to the same photograph. With them the axes of the configurations, and the edges of the bins.
-
-    Raises
-    ------
-    ArgumentError, DatasetError
-        As in `sweep.analysis.simulation_gap`.
-    """
-    if not is_measured(photographs):
-        raise DatasetError(
-            "the first dataset: expected photographs, as `sweep photos` measures them; two "
-            "simulations are compared by sweep.analysis.compare"
-        )
-    for side in (photographs, simulated):
-        dataset.require_poses(side)
-    paired = is_twin(simulated)
-    first, second, kept = _same_configurations(photographs, simulated, paired=paired)
-    if bins is None:
-        bins = {} if paired else {SIDE: _quarters(first)}
-    estimator.read_bins(first, kept, bins)
-    scene = [name for name in axes_of(second, Stage.scene) if name not in kept]
-    std = second.get(TRUTH_STD)
-    first, second = (
-        side[list(ERROR_INPUTS)].assign({name: _binned(side, name) for name in bins})
-        .drop_attrs(deep=False) for side in (first, second))
-    if paired:
-        trials = _trials_of(photographs, simulated)
-        some = np.flatnonzero((trials >= 0).any(axis=1))
-        at = xr.DataArray(trials[some], dims=(DRAWS, REPEAT))
-        first, second = first.isel({DRAWS: some}), _gathered(second, at)
-        if std is not None:
-            second = _with_uncertain_truth(second, _gathered(std, at), kept)
-    elif scene and not dataset.of_photographs(simulated):
-        # Each scene counts as a photograph.
-        second = second.drop_vars(DRAWS, errors="ignore").stack(
-            unit=sorted(scene, key=lambda name: name != DRAWS), create_index=False)
-        second = second.rename(unit=DRAWS).assign_coords({PHOTOGRAPHS: ""})
-    return (first, second), kept, bins
 
 
 def is_measured(results: xr.Dataset) -> bool:
@@ -970,10 +901,10 @@ class SolvedQuantile(Statistic[Poses]):
         return [*interval.T, below.sum(axis=1)]
 
 
-GAP_RATES = tuple(ComparedRate(each.name, each.meaning, each.successes, each.used)
-              for each in (DETECTION_RATE, FLIP_RATE))
-
-GAP_QUANTILES = (
+#: All, in the order of the table.
+GAP_STATISTICS: tuple[ComparedRate | SolvedQuantile, ...] = (
+    *(ComparedRate(each.name, each.meaning, each.successes, each.used)
+      for each in (DETECTION_RATE, FLIP_RATE)),
     SolvedQuantile("range_bias_percent", "median depth error of the true depth, solved",
                    lambda poses: poses.range_percent[..., 0], units="percent"),
     *(SolvedQuantile(
@@ -981,9 +912,6 @@ GAP_QUANTILES = (
         quantity.norm, percent, ratio=True, units=quantity.units)
       for quantity in QUANTITIES[:2] for statistic, percent in PERCENTS.items()),
 )
-
-#: All, in the order of the table.
-GAP_STATISTICS: tuple[ComparedRate | SolvedQuantile, ...] = (*GAP_RATES, *GAP_QUANTILES)
 
 COUNTS: tuple[Statistic[Poses], ...] = (
     Count("looked_for", "markers that were run, visible and modelled",
@@ -1055,9 +983,37 @@ def simulation_gap(
     >>> gap["rotation_median_deg_gap"].values.tolist(), gap["solved"].values.tolist()
     ([1.0], [[13], [13]])
     """
-    sides, kept, bins = matched_sides(photographs, simulated, bins)
+    if not is_measured(photographs):
+        raise DatasetError(
+            "the first dataset: expected photographs, as `sweep photos` measures them; two "
+            "simulations are compared by sweep.analysis.compare"
+        )
+    for side in (photographs, simulated):
+        dataset.require_poses(side)
     paired = is_twin(simulated)
-    tables = [table for side in sides for table in estimator.aggregates(
+    first, second, kept = _same_configurations(photographs, simulated, paired=paired)
+    if bins is None:
+        bins = {} if paired else {SIDE: _quarters(first)}
+    estimator.read_bins(first, kept, bins)
+    scene = [name for name in axes_of(second, Stage.scene) if name not in kept]
+    std = second.get(TRUTH_STD)
+    first, second = (
+        side[list(ERROR_INPUTS)].assign({name: _binned(side, name) for name in bins})
+        .drop_attrs(deep=False) for side in (first, second))
+    if paired:
+        # Trials of the same index are then of the same photograph.
+        trials = _trials_of(photographs, simulated)
+        some = np.flatnonzero((trials >= 0).any(axis=1))
+        at = xr.DataArray(trials[some], dims=(DRAWS, REPEAT))
+        first, second = first.isel({DRAWS: some}), _gathered(second, at)
+        if std is not None:
+            second = _with_uncertain_truth(second, _gathered(std, at), kept)
+    elif scene and not dataset.of_photographs(simulated):
+        # Each scene counts as a photograph.
+        second = second.drop_vars(DRAWS, errors="ignore").stack(
+            unit=sorted(scene, key=lambda name: name != DRAWS), create_index=False)
+        second = second.rename(unit=DRAWS).assign_coords({PHOTOGRAPHS: ""})
+    tables = [table for side in (first, second) for table in estimator.aggregates(
         side, dataset.pose_arrays(side, ERROR_INPUTS), kept, [[*COUNTS, *GAP_STATISTICS]],
         Poses, bins, stopped=False)]
     first, second = (table.drop_vars([

@@ -116,19 +116,19 @@ def require(
     found = [] if table is None else judged.verdicts(table)
     worse = [] if against is None else comparisons.regressions(
         selected_store(against, at)[0], results, [each.what.name for each in required], axes)
-    decision = Decision.met if table is None else Decision(int(
-        judged.combined_decision(table["decision"].to_numpy())))
-    if any(each.worse for each in worse):
-        decision = Decision.not_met
+    decisions = np.array([each.decision for each in found] or [Decision.met], np.uint8)
+    decision = Decision.not_met if any(each["worse"] for each in worse) else Decision(int(
+        judged.combined_decision(decisions)))
     named = {*axes, dataset.DRAWS, *dataset.configuration_axes(results)}
     pooled = [name for name in dataset.axes_of(results)
               if name not in named and results.sizes[name] > 1]
     parts: list[Table | str] = [decision_table(found), Table.of(
         "Compared with the older store pose by pose, new minus old",
         ("", "quantity", "configuration", "difference", "condition"),
-        [["worse" if each.worse else "not worse", each.quantity, described(each.configuration),
-          valued(each.difference, each.low, each.high, each.units), described(each.condition)]
-         for each in worse], words=True)]
+        [["worse" if each["worse"] else "not worse", each["quantity"],
+          described(each["configuration"]),
+          valued(each["difference"], each["low"], each["high"], each["units"]),
+          described(each["condition"])] for each in worse], words=True)]
     if table is not None:
         parts.append(condition_table(found, table, every=every))
     parts.append(f"conditions (--per): each value of {', '.join(axes) or 'no axis'}; pooled over "

@@ -34,7 +34,7 @@ def test_a_worse_error_is_found_as_by_plain_paired_intervals(factor):
     new = changed(old, factor=factor)
     tests = 2 * 3 * 2  # configurations, conditions, kinds
     found = [each for each in regressions(old, new, ["range_p95_percent"], ["side_px"])
-             if each.units == "percent"]
+             if each["units"] == "percent"]
     for solver, one in enumerate(found):
         worse = []
         for side in range(3):
@@ -42,24 +42,24 @@ def test_a_worse_error_is_found_as_by_plain_paired_intervals(factor):
             paired = stats.ttest_1samp(percent(new, side, solver) - before, 0.0)
             interval = paired.confidence_interval(1.0 - 0.05 / tests)
             worse.append(interval.low > MARGIN * before.mean())
-            if old["side_px"].values[side] == one.condition["side_px"]:
-                assert one.low == pytest.approx(interval.low, rel=1e-6)
-                assert one.high == pytest.approx(interval.high, rel=1e-6)
-        assert one.worse == any(worse)
-    assert any(one.worse for one in found) == (factor > 1.05)
+            if old["side_px"].values[side] == one["condition"]["side_px"]:
+                assert one["low"] == pytest.approx(interval.low, rel=1e-6)
+                assert one["high"] == pytest.approx(interval.high, rel=1e-6)
+        assert one["worse"] == any(worse)
+    assert any(one["worse"] for one in found) == (factor > 1.05)
 
 
 @pytest.mark.parametrize("lost", [0, 9, 10])
 def test_a_worse_rate_is_found_as_by_the_exact_test(lost):
     old = perfect(np.random.default_rng(4), SIZES)
     found = regressions(old, changed(old, lost=[0, lost]), ["detection_rate"], ["side_px"])
-    rate = next(one for one in found if one.quantity == "detection_rate")
+    rate = next(one for one in found if one["quantity"] == "detection_rate")
     tests = 2 * 3 * 3
     p_value = stats.binomtest(lost, lost, 0.5).pvalue if lost else 1.0
-    assert rate.worse == (p_value <= 0.05 / tests)
+    assert rate["worse"] == (p_value <= 0.05 / tests)
     if lost:
-        assert rate.condition == {"side_px": 20.0}
-        assert rate.difference == pytest.approx(-lost / 80)
+        assert rate["condition"] == {"side_px": 20.0}
+        assert rate["difference"] == pytest.approx(-lost / 80)
 
 
 def test_other_scenes_are_not_compared():
@@ -74,7 +74,7 @@ def test_chance_alone_is_rarely_worse(claim):
     worse = 0
     for seed in range(400):
         old = perfect(np.random.default_rng(seed), {"side_px": 3, "trial": 60, "solver": 1})
-        worse += any(one.worse for one in regressions(
+        worse += any(one["worse"] for one in regressions(
             old, changed(old, seed=seed + 1000), ["range_rmse_percent"], ["side_px"]))
     claim("stores that are worse by chance alone", "400 simulated pairs; 5 % are allowed",
           worse / 4, "%")

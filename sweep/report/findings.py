@@ -131,8 +131,8 @@ def require(
           described(each["condition"])] for each in worse], words=True)]
     if table is not None:
         parts.append(condition_table(found, table, every=every))
-    parts.append(f"conditions (--per): each value of {', '.join(axes) or 'no axis'}; pooled over "
-                 f"{', '.join(pooled) or 'none'}")
+    parts.append(f"conditions (--per): {'each value of ' if axes else 'none'}{', '.join(axes)}; "
+                 f"pooled over {', '.join(pooled) or 'none'}")
     return Findings(
         parts, {
             "decision": decision, "per": axes, "pooled": pooled, "against": worse,

@@ -812,8 +812,8 @@ def fit(
          f"{'kept' if each.kept else 'left out'}{': ' if each.reason else ''}{each.reason}")
         for each in found.terms]
     lines = [library.table.Table.of(
-        f"{found.markers} markers in {found.photographs} photographs; 95 % intervals by photograph",
-        ("term", "parameter", "value", ""), rows, stub=2, words=True),
+        f"{found.markers} markers in {found.photographs} photographs; 95 % intervals by photograph,"
+        " from 4 on", ("term", "parameter", "value", ""), rows, stub=2, words=True),
         *(f"- {line}" for line in found.lines)]
     held_out = None if gap is None else library.findings.gap_table(gap)
     if held_out is not None:

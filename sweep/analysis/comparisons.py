@@ -826,7 +826,7 @@ def _binned(results: xr.Dataset, name: str) -> xr.DataArray:
         return results[name].reset_coords(drop=True)
     distance = results["true_tvec_m"].isel(xyz=2, drop=True)
     if name == SIDE:
-        return dataset.focal_size_of(results) / distance
+        return (dataset.focal_size_of(results) / distance.drop_attrs()).assign_attrs(units="px")
     if name == "distance_m":
         return distance
     raise DatasetError(f"{name}: both datasets need it for bins; one has "

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from sweep.errors import StoreError, path_of
+from sweep.errors import ArgumentError, StoreError, path_of
 from sweep.messages import plain
 from sweep.store.files import check_folder_writable, write_whole
 from sweep.store.locations import enclosing_store, reason_of
@@ -27,15 +27,15 @@ def figure_file(
 
     Raises
     ------
-    StoreError
-        If the suffix names no format, or as :func:`check_output_file`.
+    ArgumentError, StoreError
+        If the suffix names no format; as :func:`check_output_file`.
     """
     if name is None:
         return None
     path = Path(path_of("output", name))
     if path.suffix.lower() not in suffixes:
         endings = " or ".join(filter(None, suffixes))
-        raise StoreError(f"{path}: expected a file that ends in {endings}")
+        raise ArgumentError("output", str(path), f"expected a file that ends in {endings}")
     check_output_file(path)
     return path
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import socket
 import time
 from collections.abc import Mapping, Sequence
@@ -48,22 +49,28 @@ def _rows(pipeline: Pipeline, block: Block, old: Pipeline) -> dict[str, NDArray[
     They are of shape (scenes, detector settings, estimators).
     """
     new_axes, old_axes = both_axes(pipeline, old)
-    scenes = pipeline.axes_of(Stage.scene)
-    starts = dict(zip((axis.name for axis in scenes), block.starts, strict=True))
-    lengths = dict(zip(starts, block.shape, strict=True))
-    shape = [lengths.get(axis.name, len(axis)) for axis in new_axes]
-    values: dict[str, list[Any]] = {}
-    for axis, indices in zip(new_axes, np.indices(shape), strict=True):
-        along = (indices.ravel() + starts.get(axis.name, 0)).tolist()
-        values |= {name: [column[k] for k in along] for name, column in axis.columns.items()}
+    along = [range(len(axis)) for axis in new_axes]
+    along[:len(block.starts)] = map(range, block.starts, block.stops)  # axes of scenes are first
+    shape = len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation)
     found = {}
     for axis in old_axes:
-        cells = [*zip(*(values[name] for name in axis.columns), strict=True)]
-        rows = {cell: axis.index_of(dict(zip(axis.columns, cell, strict=True)))
-                for cell in set(cells)}
-        found[axis.name] = np.array(
-            [-1 if (row := rows[cell]) is None else row for cell in cells], dtype=np.intp,
-        ).reshape(len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
+        # Values are looked up along those new axes alone that give them: a block has many cells.
+        giving = [k for k, each in enumerate(new_axes) if axis.columns.keys() & each.columns.keys()]
+        cells = []
+        for indices in itertools.product(*(along[k] for k in giving)):
+            values: dict[str, Any] = {}
+            for k, index in zip(giving, indices, strict=True):
+                values |= new_axes[k].at(index)
+            cells.append(tuple(values[name] for name in axis.columns))
+        wanted, own = set(cells), axis.values
+        if isinstance(own, range):
+            rows = {cell: own.index(cell[0]) for cell in wanted if cell[0] in own}
+        else:
+            rows = {cell: k for k, cell in enumerate(zip(*axis.columns.values(), strict=True))
+                    if cell in wanted}
+        lengths = [len(part) if k in giving else 1 for k, part in enumerate(along)]
+        numbers = np.array([rows.get(cell, -1) for cell in cells], dtype=np.intp).reshape(lengths)
+        found[axis.name] = np.broadcast_to(numbers, [*map(len, along)]).reshape(shape)
     return found
 
 

@@ -247,6 +247,9 @@ class Children(Executor):
             return child.call(compute_block, *arguments, limit_s=2 * limit_s)
         except ChildError as error:
             return Failed(error.line, error.from_outside, isinstance(error, ChildDiedError))
+        except Exception:  # of the machine, perhaps of this process: another one tries again
+            child.close()
+            raise
         finally:
             self._idle.put(child)
 

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import socket
 import time
+from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -56,12 +57,8 @@ def _rows(pipeline: Pipeline, block: Block, old: Pipeline) -> dict[str, NDArray[
     for axis in old_axes:
         # Values are looked up along those new axes alone that give them: a block has many cells.
         giving = [k for k, each in enumerate(new_axes) if axis.columns.keys() & each.columns.keys()]
-        cells = []
-        for indices in itertools.product(*(along[k] for k in giving)):
-            values: dict[str, Any] = {}
-            for k, index in zip(giving, indices, strict=True):
-                values |= new_axes[k].at(index)
-            cells.append(tuple(values[name] for name in axis.columns))
+        given = itertools.product(*([new_axes[k].at(i) for i in along[k]] for k in giving))
+        cells = [tuple(ChainMap(*each)[name] for name in axis.columns) for each in given]
         wanted, own = set(cells), axis.values
         if isinstance(own, range):
             rows = {cell: own.index(cell[0]) for cell in wanted if cell[0] in own}

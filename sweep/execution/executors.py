@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Generator, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple, Self
 
@@ -153,10 +153,9 @@ class Executor(ABC):
     def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
         """Have a block computed, rather not where it failed; return a future."""
 
-    def result(self, future: Any) -> Receipt | Failed:
+    def result(self, future: Future[Receipt | Failed]) -> Receipt | Failed:
         """Return the receipt of a future that is done, or why there is none."""
-        found: Receipt | Failed = future.result()
-        return found
+        return future.result()
 
     def elsewhere(self, failures: list[Failed]) -> bool:
         """Return whether a block that machines failed may be tried again: here once."""
@@ -234,9 +233,8 @@ class Children(Executor):
         """Return how many processes there are."""
         return f"{len(self._children)} processes"
 
-    def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
+    def submit(self, arguments: tuple[Any, ...], _failures: list[Failed]) -> Any:
         """Have a thread call a child that is idle."""
-        del failures
         return self._pool.submit(attempt, self._call, *arguments)
 
     def _call(self, *arguments: Any) -> Receipt | Failed:

@@ -16,7 +16,6 @@ import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from types import FrameType
 from typing import Any, Self, TypeVar, cast
 
 from sweep.errors import SweepError
@@ -219,7 +218,6 @@ def serve(module: str, descriptor: str) -> None:
 
     with contextlib.suppress(EOFError):
         while request := connection.recv_bytes():
-            answer: tuple[bool, Any]
             try:
                 function, arguments, limit_s = pickle.loads(request)  # noqa: S301  (the parent's)
                 with ending_after(limit_s):
@@ -269,8 +267,7 @@ class Interrupts:
         if self._before is not None:
             signal.signal(signal.SIGINT, self._before)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        del number, frame
+    def _note(self, *_: object) -> None:
         if self._noted:
             raise KeyboardInterrupt
         self._noted = True

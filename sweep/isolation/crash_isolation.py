@@ -275,7 +275,7 @@ LIMIT_S = 60.0
 MAX_SETTINGS = 64
 
 
-def check_plugins(child: Child, pipeline: Pipeline, limit_s: float = LIMIT_S) -> None:
+def check_plugins(child: Child, pipeline: Pipeline) -> None:
     """Use a pipeline's plug-ins in a child process, which goes on to work.
 
     Raises
@@ -287,7 +287,7 @@ def check_plugins(child: Child, pipeline: Pipeline, limit_s: float = LIMIT_S) ->
     if not pipeline.plugins:
         return
     try:
-        child.call(use, pipeline, limit_s=limit_s * len(pipeline.plugins))
+        child.call(use, pipeline, limit_s=LIMIT_S * len(pipeline.plugins))
     except ChildError as error:
         names = " or ".join(f"{plugin.kind} {plugin.name}" for plugin in pipeline.plugins)
         raise PluginError(f"{names}: {error.line}") from None

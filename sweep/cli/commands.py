@@ -811,10 +811,15 @@ def fit(
          if math.isfinite(each.estimate.low) else each.estimate.value,
          f"{'kept' if each.kept else 'left out'}{': ' if each.reason else ''}{each.reason}")
         for each in found.terms]
+    size = next(each.estimate for each in found.terms if each.parameter == "marker_scale")
+    value, low, high = (100.0 * (each - 1.0) for each in size)
+    line = (f"markers are larger than their file says by {value:.2f} % [{low:.2f}, {high:.2f}]: "
+            "measure the print")
+    said = [line] if "marker_scale" in found.scene and math.isfinite(low) else []
     lines = [library.table.Table.of(
         f"{found.markers} markers in {found.photographs} photographs; 95 % intervals by photograph,"
         " from 4 on", ("term", "parameter", "value", ""), rows, stub=2, words=True),
-        *(f"- {line}" for line in found.lines)]
+        *(f"- {line}" for line in said)]
     held_out = None if gap is None else library.findings.gap_table(gap)
     if held_out is not None:
         lines += ["", "Half of the photographs, simulated with the scene of the others:", held_out]
@@ -824,7 +829,7 @@ def fit(
         then = quoted("sweep", "compare", store, output), "simulates the photographs with it"
     return cli.findings(lines, {
         "scene": found.scene, "photographs": found.photographs, "markers": found.markers,
-        "terms": [each.as_json() for each in found.terms], "lines": list(found.lines),
+        "terms": [each.as_json() for each in found.terms], "lines": said,
         "check": [] if held_out is None else held_out.as_json()["rows"], "output": output,
     }, 0, *then)
 

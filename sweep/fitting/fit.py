@@ -499,8 +499,6 @@ class SceneFit(NamedTuple):
         Every parameter with its interval, kept or left out.
     photographs, markers
         How many of them were fitted.
-    lines
-        Lines for the user beside the terms.
     views, tested_fits
         The pixels that were fitted, as if evenly spaced, and the fits with all effects, by the
         photograph's number.
@@ -509,7 +507,6 @@ class SceneFit(NamedTuple):
     terms: tuple[Term, ...]
     photographs: int
     markers: int
-    lines: list[str]
     views: Views
     tested_fits: Mapping[int, PhotographFit]
 
@@ -598,17 +595,10 @@ def fit_scene(
         each if keep else test
         for each, keep, test in zip(_optics(found), kept, tested, strict=True)
     ]
-    fits, lines = list(found.values()), []
+    fits = list(found.values())
     terms = _terms(fits, optics, tested, refused, decimation)
-    size = next(each for each in terms if each.parameter == "marker_scale")
-    if size.kept and math.isfinite(size.estimate.low):
-        value, low, high = (100.0 * (each - 1.0) for each in size.estimate)
-        lines.append(
-            f"markers are larger than their file says by {value:.2f} % [{low:.2f}, {high:.2f}]: "
-            "measure the print"
-        )
     markers = sum(len(fit.states) for fit in fits)
-    return SceneFit(tuple(terms), len(fits), markers, lines, views, tested_fits)
+    return SceneFit(tuple(terms), len(fits), markers, views, tested_fits)
 
 
 def _fitted(views: Views, moved: Masks, start: Floats) -> dict[int, PhotographFit]:
@@ -680,6 +670,10 @@ def _terms(
     if source in (TruthSource.board_without_this_marker, TruthSource.poses_file):
         scale, unknown = of_photographs(_scale), "too few photographs or markers"
         geometry = geometry_field(fits, edges, scale.value)
+    # Noise is measured behind the compression, which at edges adds about what it takes from noise
+    # in flat areas.
+    quality = of_photographs(lambda state: state.marker.shown.jpeg_quality)
+    jpeg = judge("JPEG", "jpeg_quality", quality, unknown="no JPEG files with OpenCV's tables")
     return [
         decimation,
         Term("black", "black", black), Term("white", "white", white),
@@ -689,6 +683,7 @@ def _terms(
         *(replace(each, kept=noisy, setting=table) for each in noise), *ragged,
         judge("print's size", "marker_scale", scale, absent=1.0, unknown=unknown),
         *with_reach("geometry", "geometry_px", geometry, unknown),
+        replace(jpeg, setting=round(np.nan_to_num(quality.value))),
     ]
 
 
@@ -720,7 +715,7 @@ REPEATS = 2
 CLEARLY = 0.5
 
 #: Effects that are kept where the errors of photographs that were not fitted say so.
-SWITCHES = ("sharpening", "bloom", "geometry_px", "edge_px", "marker_scale")
+SWITCHES = ("sharpening", "bloom", "geometry_px", "edge_px", "marker_scale", "jpeg_quality")
 
 
 def gap_size(gap: xr.Dataset, widths: xr.Dataset) -> float:
@@ -838,9 +833,7 @@ def scene_document(pipeline: Pipeline, views: Views, found: SceneFit) -> dict[st
             pose[name] = {"uniform": [-shortened(each), shortened(each)]}
     return {
         "title": f"The camera of {plain(pipeline.name)}",
-        "camera": {
-            name: list(fixed[name]) if name == "distortion" else fixed[name] for name in CAMERA
-        },
+        "camera": {name: fixed[name] for name in CAMERA},
         "marker": marker,
         "pose": pose,
         "scene": found.scene,
@@ -865,7 +858,7 @@ def scene_text(
         f"SHA-256 of their digests {digest[:16]}. Value, 95 % interval by photograph:",
         *(f"  {each.parameter}: {in_words(each.estimate)}" for each in found.terms if each.kept),
         *(f"  left out: {each.name}: {each.reason}" for each in found.terms if not each.kept),
-        *lines, *found.lines,
+        *lines,
     ]
     return "".join(f"# {plain(line, 200)}\n" for line in head) + "\n" + document_text(document)
 

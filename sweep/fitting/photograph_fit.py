@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from scipy import optimize
 
@@ -18,7 +19,7 @@ from sweep.measure.surroundings import BoardMarker, clear_modules, ring_modules
 from sweep.model.board import Board, single_marker
 from sweep.model.calibration import VIEW, Calibration
 from sweep.model.coverage import MarkerEdges
-from sweep.model.image_file import photograph_image, reference
+from sweep.model.image_file import JPEG, photograph_image, read_image, reference
 from sweep.model.marker import OUTSIDE, module_count, overhang
 from sweep.model.polygon import Optics, Projection, side_lengths
 from sweep.photographs.cameras import cameras_of, derivatives
@@ -49,7 +50,7 @@ class Shown(NamedTuple):
     """A marker in a photograph: its true pose (3, 3), (3,) m, and where that comes from.
 
     ``marker`` is the marker alone, ``size_m`` its side, ``on_board`` its place on a board, None of
-    a single one; ``width_px`` is the photograph's.
+    a single one; ``width_px`` and ``jpeg_quality`` (:func:`quality_of`) are the photograph's.
     """
 
     rotation: Floats
@@ -60,6 +61,7 @@ class Shown(NamedTuple):
     marker: Board
     size_m: float
     on_board: BoardMarker | None
+    jpeg_quality: float
 
     def pixels(self, points: Floats) -> Floats:
         """Return the true images (n, 2) of columns and rows (n, 2), shares of the square's side."""
@@ -138,14 +140,16 @@ def photograph_views(pipeline: Pipeline, most: int = MARKERS) -> tuple[Views, li
     on_board = record.on_board(record.marker_id)
     sizes = np.broadcast_to(pipeline.values_of("size_m"), len(on_board)).tolist()
     for number, (path, digest) in enumerate(zip(record.paths, record.digests, strict=True)):
-        image = photograph_image(reference(Path(pipeline.folder) / path, digest, record.part))
+        file = Path(pipeline.folder) / path
+        image = photograph_image(reference(file, digest, record.part))
+        quality = quality_of(read_image(str(file)))
         every = [
             Shown(
                 record.rotation[number, k], record.translation[number, k],
                 TruthSource(int(record.source[number, k])), camera, record.width_px,
                 single_marker(
                     fixed["dictionary"], int(record.marker_id[k]), fixed["quiet_zone_modules"]
-                ), sizes[k], on_board[k],
+                ), sizes[k], on_board[k], quality,
             ) for k in np.flatnonzero(record.shown[number]).tolist()
         ]
         seen = [marker_view(shown, image) for shown in _spread(every, image.shape, most)]
@@ -165,6 +169,20 @@ def photograph_views(pipeline: Pipeline, most: int = MARKERS) -> tuple[Views, li
     cut = count - len(views)
     line = f"left out {cut} of {count} photographs, in which white is saturated: expose less"
     return views, [line] if cut else []
+
+
+def quality_of(encoded: bytes) -> float:
+    """Return the quality, 1 to 100, at which OpenCV writes the luminance table of a JPEG file.
+
+    NaN if the file has another table, or none.
+    """
+    blank, qualities = np.zeros((8, 8), dtype=np.uint8), {-1: np.nan}
+    for quality in range(1, 101):
+        _, code = cv2.imencode(".jpg", blank, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        # Behind marker and length: the number 0, and 64 bytes. A preview's table comes earlier.
+        table = code.tobytes().partition(b"\xff\xdb\0\x43")[2][:65]
+        qualities.setdefault(encoded.rfind(table), quality)
+    return qualities[max(qualities)] if encoded.startswith(JPEG) else np.nan
 
 
 def _spread(every: Sequence[Shown], shape: tuple[int, ...], most: int) -> list[Shown]:
@@ -336,12 +354,6 @@ class MarkerState(NamedTuple):
     def levels(self) -> Floats:
         """Levels b and c, (2,)."""
         return self.parameters[CORNERS:OWN]
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of the residuals."""
-        freedom = max(len(self.residuals) - OWN, 1)
-        return float(np.sqrt((self.residuals**2).sum() / freedom))
 
 
 def _of_corners(at: Floats, reach: float) -> Floats:
@@ -521,10 +533,10 @@ def _shared_step(
 
 def _good(states: Sequence[MarkerState]) -> list[MarkerState]:
     """Return the states of markers that are no outliers."""
-    limit = OUTLIER * float(np.median([each.noise for each in states])) if states else 0.0
+    limit = OUTLIER * float(np.median([each.residuals.std() for each in states])) if states else 0.0
     return [
         each for each in states
-        if each.noise <= max(limit, 1.0) and abs(each.levels[1]) > MIN_CONTRAST
+        if each.residuals.std() <= max(limit, 1.0) and abs(each.levels[1]) > MIN_CONTRAST
         and np.abs(each.shifts).max() < MAX_SHIFT_PX
     ]
 

@@ -13,6 +13,7 @@ from support.board_scenes import BoardPose, board_scene
 from support.reports import command
 from sweep.analysis.comparisons import GAP_STATISTICS
 from sweep.fitting.fit import REPEATS, needed
+from sweep.fitting.photograph_fit import quality_of
 from sweep.model.exposure import marker_boxes
 from sweep.model.pose import rotation_of_angles
 from sweep.model.renderers import render_all
@@ -25,7 +26,7 @@ TRUTH = {
     "marker_scale": 1.004, **LEVELS,
 }
 EFFECTS = TRUTH | {"noise_grey": 2.0}
-PLAIN = LEVELS | {"blur_px": 0.5, "noise_grey": 1.0, "decimation": 5 / 3}
+PLAIN = LEVELS | {"blur_px": 0.5, "noise_grey": 1.0, "decimation": 5 / 3, "jpeg_quality": 90}
 
 
 def drawn_pose(rng):
@@ -46,7 +47,8 @@ def taken(folder, effects, seed, count):
 
     Of a ``marker_scale`` the board's file has smaller markers than are printed."""
     effects, rng = dict(effects), np.random.default_rng(seed)
-    scale = effects.pop("marker_scale", 1.0)
+    scale, quality = effects.pop("marker_scale", 1.0), effects.pop("jpeg_quality", None)
+    end, setting = (".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality]) if quality else (".png", [])
     frame = {"width_px": SIZE[0], "height_px": SIZE[1], "fx_px": FX}
     shots = folder / "shots"
     shots.mkdir(parents=True)
@@ -54,7 +56,7 @@ def taken(folder, effects, seed, count):
         scenes = board_scene(board(), frame, drawn_pose(rng), seed * 100_000 + number, **effects)
         (image,) = render_all(
             scenes, np.array([0]), marker_boxes(scenes), np.array([[0, 0, *SIZE]]))
-        cv2.imwrite(str(shots / f"photo_{number:02d}.png"), image)
+        cv2.imwrite(str(shots / f"photo_{number:02d}{end}"), image, setting)
     files = {"camera": folder / "camera.json", "board": folder / "board.toml"}
     files["camera"].write_text(camera(view=(FX, FX, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)))
     files["board"].write_text(toml(marker_m=BOARD["marker_m"] / scale))
@@ -105,11 +107,26 @@ def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path)
     assert terms["blur_px"]["kept"]
     assert terms["blur_px"]["value"] == pytest.approx(0.5, abs=0.02)
     assert found["scene"]["decimation"] == 1.667
+    assert found["scene"]["jpeg_quality"] == 90
     absent = [name for name in ("sharpening", "bloom", "geometry_px") if not terms[name]["kept"]]
     assert len(absent) >= 2  # a false alarm of each has a probability of 5 %
     for name in absent:
         assert f"#   left out: {terms[name]['name']}: {terms[name]['reason']}\n" in text
         assert name not in found["scene"]
+
+
+def test_the_quality_of_a_jpeg_file_is_the_one_of_its_own_table():
+    image = np.random.default_rng(4).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+
+    def encoded(end, *setting):
+        return cv2.imencode(end, image, setting)[1].tobytes()
+
+    for quality in (1, 50, 75, 100):
+        file = encoded(".jpg", cv2.IMWRITE_JPEG_QUALITY, quality)
+        preview = b"\xff\xe1" + encoded(".jpg", cv2.IMWRITE_JPEG_QUALITY, 30)
+        assert quality_of(file) == quality_of(file[:2] + preview + file[2:]) == quality
+        assert np.isnan(quality_of(file.replace(b"\xff\xdb\0\x43\0", b"\xff\xdb\0\x43\1")))
+    assert np.isnan(quality_of(encoded(".png")))
 
 
 def gap(simulated, photographs=1.0):

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 
 from sweep.measure.detectors import DetectorSetting
 from sweep.model.marker import modules
-from sweep.report.figure import COLOURS, FAINT, INK
+from sweep.report.figure import COLOURS, INK
 
 BLUE, VERMILION, GREEN, _, SKY, ORANGE, _ = COLOURS
-RULE, STRIP = "#e6e6e6", "#f3f3f3"
+FAINT, RULE, STRIP = "#7a7a7a", "#e6e6e6", "#f3f3f3"
 STYLE = {
     "font.size": 9, "axes.titlesize": 9.5, "axes.titlelocation": "left",
     "axes.titleweight": "bold", "axes.edgecolor": FAINT, "axes.labelcolor": INK,

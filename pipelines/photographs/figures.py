@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sweep.measure.flags import EstimateStatus
-from sweep.report.figure import COLOURS, FAINT, INK, STYLE
+from sweep.report.figure import COLOURS, INK, STYLE
 
 WIDTH = 9.0
 """Inches; a point is 1.4 px where the figure is 900 px wide."""
@@ -80,7 +80,7 @@ def _draw_ranges(axes: Axes, results: Mapping[str, xr.Dataset], refinement: str)
     for source, style in LINES.items():
         values = np.clip(errors(results[source], refinement)[1], -MOST_PERCENT, MOST_PERCENT)
         axes.step(values, np.arange(1, len(values) + 1) / len(values), where="post", **style)
-    axes.axvline(0, color=FAINT, lw=0.7)
+    axes.axvline(0, color="#7a7a7a", lw=0.7)
     axes.set(xlim=(-4, MOST_PERCENT), ylim=(0, 1), xlabel="depth error, %")
     axes.grid(visible=True)
 

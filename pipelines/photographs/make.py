@@ -45,7 +45,8 @@ REFINEMENTS = ("none", "subpix", "contour", "apriltag")
 SETTINGS = [f"cornerRefinementMethod={list(REFINEMENTS)}".replace("'", '"')]
 
 NEW = ("sharpening", "sharpening_px", "bloom", "noise_table", "noise_correlation", "geometry_px",
-       "geometry_length_px", "edge_px", "edge_length_px", "marker_scale", "jpeg_quality")
+       "geometry_length_px", "edge_px", "edge_length_px", "marker_scale",
+       "decimation", "jpeg_quality")
 """Effects that simulations had not before photographs were measured."""
 
 REPEATS = 4

@@ -156,8 +156,8 @@ def looks_factor(count: int) -> float:
 # --------------------------------------------------------------------------------------------------
 # Columns in memory; quantities of single poses are computed a block at a time.
 
-#: Poses in a block: a thread needs 25 MB for so many.
-MAX_BLOCK = 1 << 17
+#: Poses in a block: a thread needs 13 MB for so many.
+MAX_BLOCK = 1 << 16
 
 #: Poses of which views are kept for all statistics: what they compute takes some 200 MB.
 MAX_SHARED = 1 << 20

@@ -28,10 +28,10 @@ PIPELINE = sweep.Pipeline.from_dict(
     RuntimeError("can't start new thread"), machine_faults.ERRORS["opencv memory"](),
 ], ids=lambda error: type(error).__name__)
 def test_faults_of_a_machine_are_told_from_results(error):
-    assert machine_fault(error).fault.startswith(type(error).__name__)
+    assert type(error).__name__ in str(machine_fault(error))
     outer = ValueError("raised while the other was handled")
     outer.__context__ = error
-    assert machine_fault(outer).fault.startswith(type(error).__name__)
+    assert type(error).__name__ in str(machine_fault(outer))
 
 
 def test_what_data_may_cause_is_no_fault_of_the_machine():

@@ -688,10 +688,10 @@ def error_model(
     at : --at NAME=VALUE,...
         Only these values of an axis, such as solver=ippe; may be repeated.
     """
+    files = library.findings.error_model_files(error_model or ["error_model.json"])
     data = library.report_data.read_report_data(store)
     results = library.findings.selected(data.results, at, data.pipeline)
-    data = dataclasses.replace(data, results=results)
-    return library.findings.model_findings(data, error_model or ["error_model.json"])
+    return library.findings.model_findings(dataclasses.replace(data, results=results), files)
 
 
 @cli.command("answers", "pipelines/calibration/README.md", {

@@ -553,16 +553,10 @@ def gap_figure(gap: xr.Dataset) -> Figure:
 # --------------------------------------------------------------------------------------------------
 # Error models of a store: their table and their JSON.
 
-#: What every file says: schema, frame, formula, and what the errors are.
-ERROR_MODEL = Path(__file__).parent / "templates" / "error_model.json"
-
 #: Variables of the models that the file has of each quantity.
 OF_QUANTITIES = (
     *(f"{name}{end}" for name in ("sigma", "bias") for end in INTERVAL), "knots",
     "coverage")
-
-#: Of the usual rule for one tag: sigma = 0.02 d² metres.
-RULE_M = 0.02
 
 #: Warnings of every model.
 ALWAYS = (
@@ -571,18 +565,21 @@ ALWAYS = (
 )
 
 
-def check_error_model_file(path: str) -> None:
-    """Check that a file is to hold JSON.
+def error_model_files(paths: Sequence[str]) -> list[Path]:
+    """Return the paths of JSON files, checked before there is a model.
 
     Raises
     ------
-    ArgumentError
-        If its name ends in another suffix.
+    ArgumentError, StoreError
+        If a name ends in another suffix; as `sweep.report.output_file.check_output_file`.
     """
-    if Path(path).suffix.lower() != ".json":
-        raise ArgumentError(
-            "error_model", path, "expected a file that ends in .json; pipelines/pose_errors.py "
-            "reads it, and sweep.analysis.model_covariance gives covariances for ROS")
+    for path in paths:
+        if Path(path).suffix.lower() != ".json":
+            raise ArgumentError(
+                "error_model", path, "expected a file that ends in .json; pipelines/pose_errors.py "
+                "reads it, and sweep.analysis.model_covariance gives covariances for ROS")
+        check_output_file(Path(path))
+    return [*map(Path, paths)]
 
 
 def error_model_document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -598,7 +595,8 @@ def error_model_document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[s
     edges = {name: cell_edges(models, name).tolist() for name in PREDICTORS}
     knots = {name: models[name].values.tolist() for name in PREDICTORS}
     return {
-        **json.loads(ERROR_MODEL.read_text(encoding="utf-8")), "sweep": __version__, **facts,
+        # Schema, frame, formula, and the errors' meanings, which every file has.
+        **json.loads(tables.template("error_model.json").render()), "sweep": __version__, **facts,
         "units": {name: each.units for name, each in CONDITIONS.items()},
         "conditions": {name: each.words for name, each in CONDITIONS.items()},
         "flags": {each.name: each.meaning for each in Use},
@@ -670,28 +668,23 @@ def warnings_of(models: xr.Dataset) -> list[str]:
     return [*lines, *ALWAYS]
 
 
-def model_findings(data: ReportData, paths: Sequence[str]) -> Findings:
+def model_findings(data: ReportData, files: Sequence[Path]) -> Findings:
     """Write the error models of a store; return their table and warnings.
 
     Parameters
     ----------
     data
         The store.
-    paths
-        Files whose names end in ``.json``.
+    files
+        As :func:`error_model_files` returns them.
 
     Raises
     ------
-    ArgumentError
-        If one ends in another suffix.
     StoreError
         If a file cannot be written.
     DatasetError
         As `sweep.analysis.error_models`.
     """
-    for path in paths:
-        check_error_model_file(path)
-        check_output_file(Path(path))
     models = error_models(data.results)
     content = error_model_document(models, {
         "store": data.store, "title": data.pipeline.heading,
@@ -699,22 +692,19 @@ def model_findings(data: ReportData, paths: Sequence[str]) -> Findings:
         "fingerprint": dict(data.run_metadata.get("fingerprint", {})),
         "pipeline": data.pipeline.text,
     })
-    for path in paths:
-        write_output_file(Path(path), f"{to_json(content, indent=1)}\n".encode())
+    for file in files:
+        write_output_file(file, f"{to_json(content, indent=1)}\n".encode())
     return Findings(
         [error_model_table(models), *(f"- {line}" for line in warnings_of(models))],
         content, models, 0,
-        (f"look at {', '.join(paths)}", "sigma and bias anywhere in the store's domain"))
-
-
-#: Most knots of each condition that the table shows.
-SHOWN = dict(zip(PREDICTORS, (4, 3, 3), strict=True))
+        (f"look at {', '.join(map(str, files))}", "sigma and bias anywhere in the store's domain"))
 
 
 def error_model_table(models: xr.Dataset) -> Table:
     """Return a table with a row for some knots at which each configuration has poses."""
+    # Most knots of each condition that are shown: 4, 3 and 3.
     places = {name: np.unique(np.linspace(0, models.sizes[name] - 1, most).round().astype(int))
-              for name, most in SHOWN.items()}
+              for name, most in zip(PREDICTORS, (4, 3, 3), strict=True)}
     some = models.isel(places)
     cells = {f"cell_{name}": (name, np.searchsorted(
         cell_edges(models, name)[1:-1], some[name].values, side="right")) for name in PREDICTORS}
@@ -724,8 +714,9 @@ def error_model_table(models: xr.Dataset) -> Table:
     columns = {f"{quantity}{end}": (scale * some[f"sigma{end}"]).sel(quantity=quantity, drop=True)
                for quantity in QUANTITIES for end in INTERVAL}
     sigma_z, bias_z = (some[name].sel(quantity="z", drop=True) for name in ("sigma", "bias"))
+    # The usual rule for one tag: sigma = 0.02 d² metres.
     table = xr.Dataset(columns).assign(
-        bias=1e3 * bias_z, rule=RULE_M * some["distance_m"]**2 / sigma_z,
+        bias=1e3 * bias_z, rule=0.02 * some["distance_m"]**2 / sigma_z,
         seen=(use != Use.no_poses).any("quantity").astype(int),
         use=xr.apply_ufunc(_use, use, input_core_dims=[["quantity"]], vectorize=True,
                            output_dtypes=[object]))

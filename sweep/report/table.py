@@ -6,13 +6,13 @@ import base64
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from sweep.messages import plain, to_json
 
@@ -360,7 +360,8 @@ class Findings:
         return self._printed(Table.markdown, markdown_text)
 
     def _repr_html_(self) -> str:
-        return self._printed(PARTS.table, lambda line: f"<p>{escape(line)}</p>")
+        parts = template("parts.html").module
+        return self._printed(parts.table, lambda line: f"<p>{escape(line)}</p>")
 
     def _printed(self, table: Callable[[Table], str], line: Callable[[str], str]) -> str:
         texts = [line(part) if isinstance(part, str) else f"{table(part)}\n"
@@ -425,21 +426,21 @@ def base64_text(content: bytes | str) -> str:
     return base64.b64encode(content.encode() if isinstance(content, str) else content).decode()
 
 
-TEMPLATES = Environment(
-    loader=PackageLoader("sweep.report"), autoescape=select_autoescape(["html"]),
-    undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-TEMPLATES.filters |= {"base64": base64_text, "md": markdown_text}
+@cache
+def template(name: str) -> Any:
+    """Return a template: of pages, of their tables, figures and scenes, or of captions."""
+    import jinja2  # noqa: PLC0415  (slow to import)
 
-#: HTML of a table, a figure, a scene, a card.
-PARTS: Any = TEMPLATES.get_template("parts.html").module
-
-#: The texts of figures, each a macro.
-CAPTIONS = TEMPLATES.get_template("captions.jinja").module
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sweep.report"), undefined=jinja2.StrictUndefined,
+        autoescape=jinja2.select_autoescape(["html"]), trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= {"base64": base64_text, "md": markdown_text}
+    return environment.get_template(name)
 
 
 def caption_of(name: str, **values: object) -> str:
     """Return the text of a figure, on one line; pages escape it."""
-    return " ".join(str(getattr(CAPTIONS, name)(**values)).split())
+    return " ".join(str(getattr(template("captions.jinja").module, name)(**values)).split())
 
 
 def sentences(*parts: str) -> str:

@@ -560,6 +560,7 @@ def write_report(
     for name, value in (("output", output), ("figures", figures)):
         if value is not None and not path_of(name, value).strip():
             raise ArgumentError(name, repr(value), "expected a name")
+    models = findings.error_model_files(texts_of("error_model", error_model))
     file = Path(output or f"report.{form or 'html'}")
     form = form or FORMS.get(file.suffix.lower())
     if form not in FORMS.values():
@@ -567,8 +568,8 @@ def write_report(
     beside = file.with_name(f"{file.stem}_figures") if form == "md" else None
     folders = [folder for folder in (beside, Path(figures) if figures else None) if folder]
     data = report_data.read_report_data(path_of("store", store), require, per, command)
-    if error_model:
-        findings.model_findings(data, texts_of("error_model", error_model))
+    if models:
+        findings.model_findings(data, models)
     output_file.check_output_file(file)
     for folder in folders:
         output_file.check_output_file(folder / "figure.png" if folder.is_dir() else folder)
@@ -653,7 +654,6 @@ def page(
 
     With ``folder``, the name of the folder of figures and scenes, it is Markdown.
     """
-    text = tables.TEMPLATES.get_template("page.jinja" if folder else "page.html").render(
+    return str(tables.template("page.jinja" if folder else "page.html").render(
         title=title, answer=answer, provenance=provenance, figures=figures, scenes=scenes,
-        require=require, folder=folder, legend=LEGEND)
-    return text.rstrip("\n") + "\n"
+        require=require, folder=folder, legend=LEGEND)).rstrip("\n") + "\n"

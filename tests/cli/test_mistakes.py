@@ -55,7 +55,7 @@ def folder(stores, monkeypatch):
         ("size small.toml", "expected what is chosen: [search] smallest = "),
         ("limit missing.toml", "missing.toml: cannot be read: No such file"),
         ("reference tilt", "did you mean tilt_deg?"),
-        ("error-model runs/small.zarr -o m.hpp", ".json"),
+        ("error-model missing.zarr -o m.hpp", ".json"),
         ("compare runs/small.zarr runs/small.zarr --repeats -1", "--repeats -1: expected photogr"),
         ("compare runs/small.zarr runs/small.zarr --bins side_px=1,2", "--bins"),
         ("report runs/small.zarr -o report.pdf", "expected a file that ends in .html or .md"),

@@ -2,6 +2,7 @@
 
 import errno
 import pickle
+import socket
 
 import cv2
 import numpy as np
@@ -28,10 +29,11 @@ PIPELINE = sweep.Pipeline.from_dict(
     RuntimeError("can't start new thread"), machine_faults.ERRORS["opencv memory"](),
 ], ids=lambda error: type(error).__name__)
 def test_faults_of_a_machine_are_told_from_results(error):
-    assert type(error).__name__ in str(machine_fault(error))
+    begin = f"machine fault on {socket.gethostname()}: {type(error).__name__}"
+    assert str(machine_fault(error)).startswith(begin)
     outer = ValueError("raised while the other was handled")
     outer.__context__ = error
-    assert type(error).__name__ in str(machine_fault(outer))
+    assert str(machine_fault(outer)).startswith(begin)
 
 
 def test_what_data_may_cause_is_no_fault_of_the_machine():

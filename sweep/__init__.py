@@ -336,7 +336,7 @@ def compare(
     bins
         Variable of the scene -> edges of bins in which photographs and simulation are compared.
     output
-        PNG or SVG file of the distributions of the errors.
+        PNG or SVG file of the rates and errors of both.
     repeats, store, workers, client, scheduler, reuse, overwrite, yes, progress
         As for :func:`twins`.
 

@@ -167,8 +167,7 @@ def run(
             read, library.lifecycle.store_of(pipeline, store), workers=workers, client=client,
             scheduler=scheduler, reuse=reuse, overwrite=overwrite, retry_failed=retry_failed,
             yes=yes, time_limit_s=time_limit_s, progress=report, child=child)
-    for line in summary.warnings:
-        notice(line)
+    notice(*summary.warnings)
     if summary.advice:
         notice(f"look at it: {summary.advice}")
     return open(summary.store)
@@ -256,8 +255,7 @@ def photos(
     prepared = library.prepare.prepare(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, store=store,
         overwrite=options.get("overwrite", False))
-    for line in prepared.lines:
-        notice(line)
+    notice(*prepared.lines)
     return run(prepared.pipeline, store=prepared.store, progress=progress, **options)
 
 

@@ -14,16 +14,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from sweep.errors import MachineFaultError, RunError
-from sweep.messages import local_fault
+import numba
 
-try:
-    import numba
-except (ValueError, TypeError) as error:
-    # Numba interprets its configuration while it is imported.
-    raise RunError(
-        f"Numba cannot be imported with its NUMBA_... variables: {type(error).__name__}: {error}"
-    ) from None
+from sweep.errors import MachineFaultError
+from sweep.messages import local_fault
 
 #: Rooms with compiled functions.
 ROOMS = ("model", "measure", "fitting")

@@ -9,15 +9,13 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
-from sweep.messages import nearest, plain, shown
+from sweep.messages import letters_of, nearest, plain, shown
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Declared:
     """The declaration of a value: name, types, default, meaning, unit, allowed values.
 
@@ -41,7 +39,6 @@ class Declared:
     open_low: bool = False
     choices: tuple[str, ...] = ()
     prefix: str = ""
-    numbers: tuple[tuple[str, int], ...] = ()
     drawable: bool = False
     lengths: tuple[int, ...] = ()
     list_text: str = ""
@@ -73,18 +70,14 @@ class Declared:
         """
         if word in self.choices:
             return word
-        wanted = self._letters(word.strip().replace("::", ".").rpartition(".")[2])
-        spelled = {self._letters(choice): choice for choice in self.choices}
+        prefix = letters_of(self.prefix)
+        wanted = letters_of(word.replace("::", ".").rpartition(".")[2]).removeprefix(prefix)
+        spelled = {letters_of(choice).removeprefix(prefix): choice for choice in self.choices}
         if wanted in spelled or not self.abbreviated or re.fullmatch("[a-z]*|[0-9]*", wanted):
             return spelled.get(wanted)
         # The one choice that ends so, with its number whole.
         found = [spelled[each] for each in spelled if re.fullmatch(f"[a-z]*{wanted}", each)]
         return found[0] if len(found) == 1 else None
-
-    def _letters(self, word: str) -> str:
-        """Return the letters and digits by which a choice is known."""
-        bare = word.casefold().removeprefix(self.prefix.casefold())
-        return re.sub(r"[^a-z0-9]", "", bare)
 
     def admits(self, number: float) -> bool:
         """Return whether a finite number lies in the declared range."""
@@ -104,35 +97,25 @@ class Declared:
     def check(self, value: Any) -> Any:
         """Return ``value`` in the field's type; ValueError(expectation) if not allowed."""
         found: Any = None
-        if self.reads is not None and value not in self.choices:
-            return self.reads(value)
-        if isinstance(value, (list, tuple)):
-            if len(value) in self.lengths and all(
-                    _is_number(item) and abs(item) < 1e300 for item in value):
+        match value:
+            case bool():
+                found = value if bool in self.types else None
+            case str() if str in self.types:
+                found = self.choice(value) if self.choices else value or None
+            case list() | tuple() if len(value) in self.lengths and all(map(_is_number, value)):
                 found = tuple(map(float, value))
-        elif isinstance(value, str) and str in self.types:
-            found = self.choice(value) if self.choices else value or None
-        elif isinstance(value, bool) and bool in self.types:
-            found = value
-        elif _is_number(value) and self.admits(value):
-            if int in self.types and isinstance(value, int):
+            case int() if int in self.types and self.admits(value):
                 found = value
-            elif float in self.types:
+            case int() | float() if float in self.types and self.admits(value):
                 found = float(value)
         if found is None:
-            raise ValueError(self.expected() + self._hint(value))
+            word = value.removeprefix(self.prefix) if isinstance(value, str) else ""
+            raise ValueError(f"{self.expected()}{nearest(word, self.choices)}")
         return found
-
-    def _hint(self, value: Any) -> str:
-        """Return the choice that a wrong value may stand for."""
-        if isinstance(value, str) and self.choices:
-            return nearest(value.removeprefix(self.prefix), self.choices)
-        name = next((name for name, constant in self.numbers if constant == value), None)
-        return f"; OpenCV's constant {value} is {name}" if name else ""
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 #: Ending of a field's name -> its unit, unless it declares another one; the first that fits.
@@ -157,15 +140,14 @@ def drawn(default: Any, meaning: str, low: float, high: float = math.inf, **decl
 
 def declared_fields(declaring: type) -> dict[str, Declared]:
     """Return the fields that a dataclass declares, by name."""
-    hints, declared = typing.get_type_hints(declaring), {}
+    hints, declared = get_type_hints(declaring), {}
     for field in dataclasses.fields(declaring):
         declaration = field.metadata["declaration"]
         unit = declaration.unit or next(
             (unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
         default = field.default
-        kinds = tuple(typing.get_origin(each) or each  # tuple[float, ...] is a tuple
-                      for each in typing.get_args(hints[field.name] | None)
-                      if each is not type(None))
+        kinds = tuple(get_origin(each) or each  # tuple[float, ...] is a tuple
+                      for each in get_args(hints[field.name] | None) if each is not type(None))
         if kinds == (float,) and type(default) is int:
             default = float(default)
         declared[field.name] = dataclasses.replace(
@@ -190,7 +172,7 @@ def check_table(
         if key not in declared:
             lines.append(
                 f"{plain(key)}: unknown; expected a key of {owner}: {', '.join(declared)}"
-                f"{nearest(key, list(declared))}"
+                f"{nearest(key, declared)}"
             )
             continue
         try:

@@ -34,16 +34,12 @@ def check_installation() -> None:
         import cv2  # noqa: PLC0415  (slow to import)
     except ImportError as error:
         raise StoreError(f"OpenCV cannot be imported: {plain(error)}; {REMEDY}") from None
+    loaded = f"OpenCV {getattr(cv2, '__version__', 'of no version')} is loaded"
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
-        version = getattr(cv2, "__version__", "of no version")
-        raise StoreError(
-            f"OpenCV {version} is loaded, which has no cv2.aruco.ArucoDetector: {REMEDY}"
-        )
+        raise StoreError(f"{loaded}, which has no cv2.aruco.ArucoDetector: {REMEDY}")
     found = {name: package.version for name in (OPENCV, *OTHER_OPENCV)
              for package in distributions(name=name)}
     if [*found] != [OPENCV] and multiprocessing.parent_process() is None:  # else its client says it
         listed = " and ".join(f"{name} {version}" for name, version in found.items())
-        notice(
-            f"warning: {listed or 'an unknown distribution'} installed OpenCV, not {OPENCV} alone; "
-            f"OpenCV {cv2.__version__} is loaded and recorded in stores"
-        )
+        notice(f"warning: {listed or 'an unknown distribution'} installed OpenCV, not {OPENCV} "
+               f"alone; {loaded} and recorded in stores")

@@ -15,6 +15,7 @@ import itertools
 import json
 import math
 import os
+import re
 import shlex
 import socket
 import sys
@@ -61,13 +62,13 @@ def exception_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
-def notice(line: str) -> None:
-    """Write a line to stderr about what goes on, without control characters; errors follow apart.
+def notice(*lines: str) -> None:
+    """Write lines to stderr about what goes on, without control characters; errors follow apart.
 
-    Nobody may listen: a line that cannot be written is left out.
+    Nobody may listen: lines that cannot be written are left out.
     """
     with contextlib.suppress(OSError, ValueError, AttributeError):
-        sys.stderr.write(f"{plain(line, MAX_LINE_LENGTH)}\n")
+        sys.stderr.writelines(f"{plain(line, MAX_LINE_LENGTH)}\n" for line in lines)
         sys.stderr.flush()
 
 
@@ -101,11 +102,8 @@ def label(value: Any) -> str:
     return str(list(value) if isinstance(value, tuple) else value)
 
 
-#: Names of a folder among which a similar one is searched.
-MAX_FILES = 10_000
-
-#: Longer words are not compared with known ones.
-MAX_WORD_LENGTH = 60
+#: Longer words are not compared with known ones, nor is a name with more files of its folder.
+MAX_WORD_LENGTH, MAX_FILES = 60, 10_000
 
 
 def similar(word: str, known: Collection[str], cutoff: float = 0.6) -> str:
@@ -116,7 +114,7 @@ def similar(word: str, known: Collection[str], cutoff: float = 0.6) -> str:
     """
     if not isinstance(word, str) or len(word) > MAX_WORD_LENGTH:
         return ""
-    letters, simple = _letters(word), {_letters(name): name for name in known if name != word}
+    letters, simple = letters_of(word), {letters_of(n): n for n in known if n != word}
     longer = [each for each in simple if len(letters) > 1 and letters in each]
     close = longer or difflib.get_close_matches(letters, list(simple), n=1, cutoff=cutoff)
     return simple[min(close, key=len)] if close else ""
@@ -137,20 +135,18 @@ def nearest_file(path: str | os.PathLike[str]) -> str:
 
     It is the path's name in a folder beside it, or the most similar name in its folder.
     """
-    wanted = Path(path)
-    try:
-        if wanted.exists():
-            return ""
-        below = next(wanted.parent.glob(f"*/{glob.escape(wanted.name)}"), None)
-        names = [each.name for each in itertools.islice(wanted.parent.iterdir(), MAX_FILES)]
-    except (OSError, ValueError):
-        return ""
-    near = below or wanted.with_name(similar(wanted.name, names, 0.8) or wanted.name)
+    near = wanted = Path(path)
+    with contextlib.suppress(OSError, ValueError):
+        if not wanted.exists():
+            names = [each.name for each in itertools.islice(wanted.parent.iterdir(), MAX_FILES)]
+            beside = wanted.with_name(similar(wanted.name, names, 0.8) or wanted.name)
+            near = next(wanted.parent.glob(f"*/{glob.escape(wanted.name)}"), beside)
     return "" if near == wanted else f"; did you mean {plain(near, 300)}?"
 
 
-def _letters(word: str) -> str:
-    return word.casefold().replace("_", "").replace("-", "")
+def letters_of(word: str) -> str:
+    """Return the letters and digits by which a word is known, in lower case."""
+    return re.sub(r"[\W_]", "", word.casefold())
 
 
 def to_json(content: Mapping[str, Any], indent: int | None = 2) -> str:
@@ -171,14 +167,16 @@ def to_json(content: Mapping[str, Any], indent: int | None = 2) -> str:
 
 def _json_value(value: Any) -> tuple[Any, Any]:
     """Return a value as JSON has it, and its flag: None if no number in it is infinite."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+    if isinstance(value, enum.Enum):
+        return value.name, None
+    if dataclasses.is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     elif hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping):
         found = {}
         for name, item in value.items():
-            key = name.name if isinstance(name, enum.Enum) else str(name)
+            key = str(getattr(name, "name", name))
             found[key], flag = _json_value(item)
             if flag is not None:
                 found[f"{key}_flag"] = flag
@@ -186,25 +184,10 @@ def _json_value(value: Any) -> tuple[Any, Any]:
     if isinstance(value, (list, tuple, set, frozenset)):
         pairs = [_json_value(item) for item in value]
         flags = [flag for _, flag in pairs]
-        return [item for item, _ in pairs], None if set(map(str, flags)) <= {"None"} else flags
+        return [item for item, _ in pairs], flags if any(flags) else None
     if isinstance(value, float) and not math.isfinite(value):
         return None, None if math.isnan(value) else "infinite" if value > 0 else "-infinite"
-    if isinstance(value, enum.Enum):
-        return value.name, None
     return value if isinstance(value, (str, bool, int, float, type(None))) else str(value), None
-
-
-BYTE_UNITS = ("bytes", "kB", "MB", "GB", "TB", "PB")
-
-
-def byte_count(count: int) -> str:
-    """Return a number of bytes with a decimal prefix.
-
-    >>> byte_count(999), byte_count(332_000), byte_count(10**9)
-    ('999 bytes', '332 kB', '1 GB')
-    """
-    power = min((len(str(count)) - 1) // 3, len(BYTE_UNITS) - 1)
-    return f"{count / 1000**power:.3g} {BYTE_UNITS[power]}"
 
 
 def duration(seconds: float) -> str:

@@ -322,8 +322,7 @@ def executed(
     pipeline: Pipeline, store: str, lines: Sequence[str], workers: int | None, *, overwrite: bool
 ) -> SimpleNamespace:
     """Run a pipeline into a store, after lines on stderr on what it was made of."""
-    for line in lines:
-        notice(line)
+    notice(*lines)
     SESSION.stopped = CONTINUES
     with library.progress.progress_display() as display:
         return library.runner.execute(

@@ -138,8 +138,7 @@ def execute(
     if begun is not None and begun.finished and not (again or stricter):
         blocks.check_whole(begun)
         return status.summary_of(begun, {}, time.perf_counter() - started, {})
-    for line in pipeline.facts.notes:
-        notice(line)
+    notice(*pipeline.facts.notes)
     sources = _matching_sources(url, pipeline, reuse)
     done = set() if begun is None else blocks.committed(begun) - again.keys()
     if begun is None:
@@ -428,7 +427,6 @@ def limit(
     own = f"runs/{read.name}-limit-{searched}.zarr"
     with progress_report(progress) as report:
         summary = execute(read, own if store is None else store, progress=report, **options)
-    for line in summary.warnings:
-        notice(line)
+    notice(*summary.warnings)
     limits = requirement_limits(lifecycle.open_dataset(summary.store))
     return limits.assign_attrs(store=summary.store)

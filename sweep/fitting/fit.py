@@ -967,8 +967,7 @@ def fit(
             )
         document = scene_document(pipeline, views, found)
         text = scene_text(document, found, prepare.record_of(pipeline), name, lines)
-    for line in (*prepared.lines, *lines):
-        notice(line)
+    notice(*prepared.lines, *lines)
     return FittedScene(
         found, Pipeline.from_dict(document, name=name, source="scene"), text,
         (*prepared.lines, *lines), gap,

@@ -101,7 +101,7 @@ class DetectorSetting:
     )
     cornerRefinementMethod: str = parameter(
         "none", "refinement of the corners (apriltag also replaces the search for candidates)",
-        choices=tuple(REFINEMENTS), prefix="CORNER_REFINE_", numbers=tuple(REFINEMENTS.items()),
+        choices=tuple(REFINEMENTS), prefix="CORNER_REFINE_",
     )
     cornerRefinementWinSize: int = _pixels(5, "largest half window of the sub-pixel refinement")
     relativeCornerRefinmentWinSize: float = _positive(

@@ -147,9 +147,7 @@ class EstimatorSetting:
 
     solver: str = parameter(
         "ippe_square", "; ".join(f"{name}: {each.meaning}" for name, each in SOLVERS.items()),
-        choices=tuple(SOLVERS), prefix="SOLVEPNP_",
-        numbers=tuple((name, each.method) for name, each in OPENCV_SOLVERS.items()),
-        plugin="estimator",
+        choices=tuple(SOLVERS), prefix="SOLVEPNP_", plugin="estimator",
     )
     guarded: bool = parameter(
         True, "true: the solver is called in a frame in which it is stable, checked, and replaced "

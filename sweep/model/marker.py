@@ -249,7 +249,6 @@ class Marker:
         "DICT_5X5_50", "the marker's dictionary, by OpenCV's name; tag*: AprilTag's families that "
         "OpenCV lacks; STAG_*: STag's libraries", choices=dictionary_names(), prefix="DICT_",
         abbreviated=True,
-        numbers=tuple((name, getattr(cv2.aruco, name)) for name in opencv_dictionary_names()),
     )
     marker_id: int = parameter(0, "the marker's ID in its dictionary", 0, 10**6)
     size_m: float = parameter(

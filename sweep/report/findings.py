@@ -883,8 +883,7 @@ def measure_tradeoff(
         pipeline = read_pipeline(store)
         with progress_display() if progress else contextlib.nullcontext() as display:
             summary = execute(pipeline, None, progress=display)
-        for line in summary.warnings:
-            notice(line)
+        notice(*summary.warnings)
         store = str(summary.store)
     question = {"criterion": criterion} | ({} if budget_ms is None else {"budget_ms": budget_ms})
     with stage_display() if progress else contextlib.nullcontext() as stage:

@@ -262,8 +262,7 @@ def size(
         with stage_display() if progress else contextlib.nullcontext() as stage:
             costs = choice_costs(read, rule, found, limit_s, stage or (lambda _what, _share: None))
     trials = computed_scenes(results).sum(DRAWS).compute()
-    for line in summary.warnings:
-        notice(line)
+    notice(*summary.warnings)
     return Choice(
         summary.store, rule, read.budget_ms, product_of(read, rule.at_all), found,
         tuple(costs), int(trials.sum()), trials.size, int(trials.max()), tuple(summary.warnings))

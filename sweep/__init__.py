@@ -34,12 +34,10 @@ if TYPE_CHECKING:
     from typing import Unpack
 
     import xarray as xr
-    from distributed import Client
 
     from sweep.analysis.dataset import decode_flags
     from sweep.diagnosis.detection import error_model
     from sweep.diagnosis.diagnosis import diagnose
-    from sweep.execution.on_cluster import Cluster
     from sweep.execution.progress import Progress
     from sweep.execution.runner import RunOptions, limit
     from sweep.experiment.pipeline import Pipeline
@@ -86,15 +84,8 @@ def run(
     pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
     *,
     store: str | os.PathLike[str] | None = None,
-    workers: int | None = None,
-    client: Client | Cluster | None = None,
-    scheduler: str | None = None,
-    reuse: Sequence[str | os.PathLike[str]] = (),
-    overwrite: bool = False,
-    retry_failed: bool = False,
-    yes: bool = False,
     progress: bool | Callable[[Progress], None] | None = None,
-    time_limit_s: float | None = None,
+    **options: Unpack[RunOptions],
 ) -> xr.Dataset:
     """Run a pipeline into a store and return its results.
 
@@ -164,9 +155,8 @@ def run(
     with Child() as child, library.progress.progress_report(progress) as report:
         read = library.lifecycle.read_pipeline(pipeline)
         summary = library.runner.execute(
-            read, library.lifecycle.store_of(pipeline, store), workers=workers, client=client,
-            scheduler=scheduler, reuse=reuse, overwrite=overwrite, retry_failed=retry_failed,
-            yes=yes, time_limit_s=time_limit_s, progress=report, child=child)
+            read, library.lifecycle.store_of(pipeline, store), progress=report, child=child,
+            **options)
     notice(*summary.warnings)
     if summary.advice:
         notice(f"look at it: {summary.advice}")
@@ -230,7 +220,7 @@ def photos(
         "key=value" with TOML values, as ``--set`` takes them: ``'solver=["ippe", "sqpnp"]'``.
     store
         Path or URL of the store (default: ``runs/NAME.zarr`` with the folder's name).
-    workers, client, scheduler, reuse, overwrite, yes, progress
+    workers, client, scheduler, reuse, overwrite, retry_failed, yes, progress, time_limit_s
         As for :func:`run`.
 
     Returns
@@ -281,7 +271,7 @@ def twins(
         number.
     store
         Path or URL of the twins' store (default: beside the photographs', with the scene's name).
-    workers, client, scheduler, reuse, overwrite, yes, progress
+    workers, client, scheduler, reuse, overwrite, retry_failed, yes, progress, time_limit_s
         As for :func:`run`.
 
     Returns
@@ -335,8 +325,10 @@ def compare(
         Variable of the scene -> edges of bins in which photographs and simulation are compared.
     output
         PNG or SVG file of the rates and errors of both.
-    repeats, store, workers, client, scheduler, reuse, overwrite, yes, progress
+    repeats, store
         As for :func:`twins`.
+    workers, client, scheduler, reuse, overwrite, retry_failed, yes, progress, time_limit_s
+        As for :func:`run`.
 
     Returns
     -------

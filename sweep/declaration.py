@@ -96,6 +96,8 @@ class Declared:
 
     def check(self, value: Any) -> Any:
         """Return ``value`` in the field's type; ValueError(expectation) if not allowed."""
+        if self.reads is not None and value not in self.choices:
+            return self.reads(value)
         found: Any = None
         match value:
             case bool():

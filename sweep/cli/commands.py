@@ -10,15 +10,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
 
-from rich.filesize import decimal as byte_count
-
 import sweep
 from sweep import library
 from sweep.cli import command as cli
 from sweep.cli.command import Names, Numbers
 from sweep.errors import ArgumentError
 from sweep.isolation.child_process import Child
-from sweep.messages import duration, plain, quoted
+from sweep.messages import byte_count, duration, plain, quoted
 
 if TYPE_CHECKING:
     from sweep.evaluation.inspection import SceneInspection

@@ -20,7 +20,6 @@ import xarray as xr
 import yaml
 from jinja2 import Template
 from numpy.typing import NDArray
-from rich.filesize import decimal as byte_count
 
 from sweep.errors import RunError, StoreError, check_positive
 from sweep.evaluation.opencv_threads import single_threaded
@@ -31,7 +30,7 @@ from sweep.execution.forecast import free_bytes
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import LABELS
 from sweep.measure.flags import DetectionStatus
-from sweep.messages import label, plain
+from sweep.messages import byte_count, label, plain
 from sweep.model.polygon import signed_areas
 from sweep.model.renderers import render
 from sweep.model.scene import Scenes

@@ -15,7 +15,6 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
-from rich.filesize import decimal as byte_count
 
 from sweep.errors import MachineFaultError, check_positive
 from sweep.evaluation.block import run_cells
@@ -26,7 +25,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, default_workers
 from sweep.isolation.watchdog import compilation_s
-from sweep.messages import duration
+from sweep.messages import byte_count, duration
 from sweep.sampling.rules import Stopping, block_unit, make_rule
 from sweep.store.blocks import RunStore, receipts
 from sweep.store.locations import is_remote

@@ -326,14 +326,16 @@ MAX_TRIALS = 2400
 
 
 class RunOptions(TypedDict, total=False):
-    """Options of a run that are not its pipeline and store, as `sweep.run` has them."""
+    """Options of a run that are not its pipeline and store; `sweep.run` says what they mean."""
 
     workers: int | None
     client: Client | Cluster | None
     scheduler: str | None
     reuse: Sequence[str | os.PathLike[str]]
     overwrite: bool
+    retry_failed: bool
     yes: bool
+    time_limit_s: float | None
 
 
 def limit(
@@ -373,7 +375,7 @@ def limit(
         "key=value" with TOML values, as ``--set`` takes them.
     store
         Path or URL of the store (default: ``runs/NAME-limit-AXIS.zarr``).
-    workers, client, scheduler, reuse, overwrite, yes, progress
+    workers, client, scheduler, reuse, overwrite, retry_failed, yes, progress, time_limit_s
         As in `sweep.run`.
 
     Returns

@@ -221,7 +221,7 @@ def size(
     ----------
     pipeline
         As for `sweep.run`, with the sections [require] and [search].
-    store, workers, client, scheduler, reuse, overwrite, yes, progress
+    store, workers, client, scheduler, reuse, overwrite, retry_failed, yes, progress, time_limit_s
         As for `sweep.run`.
     limit_s
         Seconds of the measurement of costs, where there are alternatives or a budget.

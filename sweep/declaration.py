@@ -73,11 +73,10 @@ class Declared:
         prefix = letters_of(self.prefix)
         wanted = letters_of(word.replace("::", ".").rpartition(".")[2]).removeprefix(prefix)
         spelled = {letters_of(choice).removeprefix(prefix): choice for choice in self.choices}
-        if wanted in spelled or not self.abbreviated or re.fullmatch("[a-z]*|[0-9]*", wanted):
-            return spelled.get(wanted)
-        # The one choice that ends so, with its number whole.
-        found = [spelled[each] for each in spelled if re.fullmatch(f"[a-z]*{wanted}", each)]
-        return found[0] if len(found) == 1 else None
+        # The one choice that is so, or that ends so, with its number whole.
+        ends = self.abbreviated and not re.fullmatch("[a-z]*|[0-9]*", wanted)
+        found = [each for each in spelled if re.fullmatch(f"{'[a-z]*' * ends}{wanted}", each)]
+        return spelled[found[0]] if len(found) == 1 else None
 
     def admits(self, number: float) -> bool:
         """Return whether a finite number lies in the declared range."""

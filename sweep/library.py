@@ -12,11 +12,10 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sweep import processor
     from sweep.analysis import camera_calibration, requirements
     from sweep.conformance import check
     from sweep.diagnosis import diagnosis, observations
-    from sweep.evaluation import block, inspection
+    from sweep.evaluation import block, inspection, results
     from sweep.exchange import answers, export, score
     from sweep.execution import forecast, progress, runner, status
     from sweep.experiment import parameters, pipeline

@@ -26,7 +26,7 @@ from typing import Any
 
 import pytest
 
-from sweep.processor import processor
+from sweep.evaluation.results import processor
 from sweep.version import __version__
 
 HERE = Path(__file__).parent

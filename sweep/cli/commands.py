@@ -441,7 +441,7 @@ def verify(
         f"{report.store}: {state}{'' if report.finished else ', unfinished'}: "
         f"{report.blocks_done:,} of {report.blocks:,} blocks, {report.files:,} files, {again}"
         + (f"; damaged: {len(damaged):,}" if damaged else ""))
-    lines += library.processor.differing_processors(report.processors, "blocks")
+    lines += library.results.differing_processors(report.processors, "blocks")
     url = quoted(store)
     if report.unstable and not damaged:
         then = f"sweep plugins check {quoted(report.unstable)}", "tries it on its own"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sweep.errors import MachineFaultError, StoreError, StoreReplacedError
 from sweep.evaluation.block import run_cells, warm_up
 from sweep.evaluation.machine_faults import machine_faults_raised
-from sweep.evaluation.results import CellsResult, to_dataset_layout
+from sweep.evaluation.results import CellsResult, processor, to_dataset_layout
 from sweep.execution import TIME_LIMIT_S
 from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage, lacking_plugins
@@ -28,7 +28,6 @@ from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_i
 from sweep.isolation.watchdog import ending_after
 from sweep.measure.flags import DetectionStatus, EstimateStatus, flag_counts
 from sweep.messages import local_fault
-from sweep.processor import processor
 from sweep.sampling.rules import Decider, Decision
 from sweep.store import blocks
 from sweep.store.blocks import Receipt, RunStore

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.evaluation.block import bound_notes
+from sweep.evaluation.results import differing_processors
 from sweep.execution.waves import InWaves, condition_count, unsettled_count
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import selection_text
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag
 from sweep.messages import plain, quoted
-from sweep.processor import differing_processors
 from sweep.store import blocks
 from sweep.store.blocks import FailedCell, Receipt, RunStore
 from sweep.store.lifecycle import open_store, write_groups

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, RunError, StoreError, SweepError
+from sweep.evaluation import results
 from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
 from sweep.evaluation.results import CellsResult, Failure, compare, is_same, to_dataset_layout
 from sweep.execution import TIME_LIMIT_S
@@ -27,7 +28,6 @@ from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.detectors import OPENCV, PluginSetting
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import nearest, plain, refusal
-from sweep.processor import processor
 from sweep.sampling.rules import scenes_needed
 from sweep.store import blocks, files, lifecycle
 from sweep.store.blocks import Receipt, RunStore
@@ -256,7 +256,7 @@ def _drawn(store: RunStore, count: int, sound: Mapping[int, Receipt]) -> list[Sc
         Scene(number, cell, values_at(
             store, store.array,
             {name: slice(k, k + 1) for name, k in zip(names, cell, strict=True)}),
-            tuple(sound[number].processors) == (processor(),))
+            tuple(sound[number].processors) == (results.processor(),))
         for number, cell in sorted(drawn)
     ]
     return [scene for scene in scenes
@@ -528,7 +528,7 @@ def _reproduced(
         values = values_at(store, store.array, index)
         unneeded = bool(values["detection"] == DetectionStatus.not_needed)
         stored = None if unneeded else values
-        exact = not (unneeded or changes) and tuple(receipt.processors) == (processor(),)
+        exact = not (unneeded or changes) and tuple(receipt.processors) == (results.processor(),)
     difference = "" if stored is None else compare(
         recomputed, stored, store.variables, same_processor=exact
     )

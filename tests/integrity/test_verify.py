@@ -265,7 +265,7 @@ def test_numbers_beyond_the_tolerance_are_told_on_this_and_on_another_processor(
     assert all(one.where.startswith("--at ") and name in one.what for one in damage)
     elsewhere = {**poisoned([FAILED], tmp_path / "notes.jsonl"), **ELSEWHERE}
     (_, receipt), = receipts(store, [0])
-    ran = started(["-c", "from sweep.processor import processor; print(processor())"],
+    ran = started(["-c", "from sweep.evaluation.results import processor; print(processor())"],
                   env=elsewhere, stdout=subprocess.PIPE, text=True)
     with ran as process:
         assert [process.communicate()[0].strip()] != receipt.processors

@@ -14,6 +14,7 @@ import sweep
 from support.stores import by_hand, editable, same
 from sweep.cli import main
 from sweep.errors import StoreError
+from sweep.evaluation.results import processor
 from sweep.execution.block_task import compute_block, match
 from sweep.execution.runner import execute
 from sweep.execution.status import close, status
@@ -21,7 +22,6 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA, VARIABLES
 from sweep.integrity.verification import reproduce, verify
 from sweep.measure.flags import EstimateStatus, present_values
-from sweep.processor import processor
 from sweep.store.blocks import committed, drop_block, missing_chunks, receipts
 from sweep.store.lifecycle import create_store, open_store
 

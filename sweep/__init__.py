@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 from sweep import experiment, library
 from sweep.errors import (
@@ -31,8 +31,6 @@ from sweep.messages import notice
 from sweep.version import __version__
 
 if TYPE_CHECKING:
-    from typing import Unpack
-
     import xarray as xr
 
     from sweep.analysis.dataset import decode_flags
@@ -358,8 +356,7 @@ def compare(
         place = os.fspath(store or library.prepare.twin_store(one, other))
         twins(one, other, repeats=repeats, store=place, progress=progress, **options)
         other = place
-    else:
-        for name, value, unset in (("store", store, None), ("repeats", repeats, 1)):
-            if value != unset:
-                raise ArgumentError(name, value, "expected photographs and a TOML file to simulate")
+    elif store is not None or repeats != 1:
+        name, value = ("repeats", repeats) if store is None else ("store", store)
+        raise ArgumentError(name, value, "expected photographs and a TOML file to simulate")
     return library.findings.compare(one, other, bins=bins or None, output=output)

@@ -59,9 +59,7 @@ class ArgumentError(SweepError, ValueError):
         return f"{self.argument}{given}: {self.problem}"
 
 
-def check_positive(
-    argument: str, value: object, expected: str, *, whole: bool = False
-) -> None:
+def check_positive(argument: str, value: object, expected: str, *, whole: bool = False) -> None:
     """Raise ArgumentError unless a value is a finite number above 0, or None."""
     kind = numbers.Integral if whole else numbers.Real
     if value is not None and not (isinstance(value, kind) and 0 < float(value) < math.inf):

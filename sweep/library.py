@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sweep.analysis import camera_calibration, requirements
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 
 if not TYPE_CHECKING:  # so that mypy knows the names above alone
 
-    def __getattr__(name: str) -> ModuleType:
+    def __getattr__(name: str) -> Any:
         """Import a module when it is first used; of two of one name, that of the later room."""
         top = Path(__file__).parent
         found = sorted((*top.glob(f"{name}.py"), *top.glob(f"*/{name}.py")))

@@ -58,8 +58,7 @@ def local_fault(fault: str) -> MachineFaultError:
 
 def exception_line(error: BaseException) -> str:
     """Return an exception as one line: its type, and the first line of its message."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+    return ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])
 
 
 def notice(*lines: str) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import json
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -60,7 +60,7 @@ class RunStore:
         """The storage that holds the store's files."""
         return self.group.store
 
-    @cached_property
+    @functools.cached_property
     def variables(self) -> tuple[Variable, ...]:
         """The variables of the pipeline."""
         return self.pipeline.experiment.variables
@@ -78,21 +78,21 @@ class RunStore:
 
     def chunk_key(self, name: str, number: int) -> str:
         """Return the key of a variable's chunk of a block."""
-        template, _ = self._chunks[name]
-        return template.format(*self.blocks.index(number))
+        template, _ = self.chunks[name]
+        return f"{name}/{template.format(*self.blocks.index(number))}"
 
     def chunk(self, name: str, values: NDArray[Any]) -> bytes:
         """Return the content of a variable's chunk of a block, as Zarr writes it.
 
         ``values`` are in the variable's dimensions. Beyond the grid's end, a chunk has fill values.
         """
-        whole = self._chunks[name][1].copy()
+        whole = self.chunks[name][1].copy()
         whole[tuple(map(slice, np.shape(values)))] = values
         return files.packed(whole.tobytes())
 
-    @cached_property
-    def _chunks(self) -> dict[str, tuple[str, NDArray[Any]]]:
-        """Variable -> key of its chunks, to be filled in with indices along axes; an empty one."""
+    @functools.cached_property
+    def chunks(self) -> dict[str, tuple[str, NDArray[Any]]]:
+        """Variable -> name of its chunks, to be filled in with indices along axes; an empty one."""
         axes = [axis.name for axis in self.pipeline.experiment.scene_axes]
         extents = dict(zip(axes, self.blocks.extents, strict=True))
         chunks = {}
@@ -103,7 +103,7 @@ class RunStore:
                 names, variable.shape(self.pipeline), strict=True))
             fill = np.array(variable.fill, dtype=np.dtype(variable.dtype).newbyteorder("<"))
             chunks[variable.name] = (
-                "/".join([variable.name, "c", *index]), np.broadcast_to(fill, tuple(shape)))
+                files.SEPARATOR.join(["c", *index]), np.broadcast_to(fill, tuple(shape)))
         return chunks
 
     @property
@@ -140,7 +140,7 @@ def root_of(storage: Store) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def receipt_key(number: int) -> str:
     """Return the key of a block's receipt."""
-    return f"{files.RECEIPTS}/c/{number}"
+    return f"{files.RECEIPTS}/c{files.SEPARATOR}{number}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -393,9 +393,9 @@ def check_not_replaced(store: RunStore) -> None:
 
 def committed(store: RunStore) -> set[int]:
     """Return the numbers of the blocks that are committed."""
-    names = files.list_folder(store.storage, f"{files.RECEIPTS}/c")
-    numbers = {int(name) for name in names if name.isascii() and name.isdecimal()}
-    return {number for number in numbers if number < len(store.blocks)}
+    names = set(files.list_folder(store.storage, files.RECEIPTS))
+    return {
+        number for number in range(len(store.blocks)) if f"c{files.SEPARATOR}{number}" in names}
 
 
 def receipts(store: RunStore, numbers: Iterable[int]) -> Iterator[tuple[int, Receipt]]:
@@ -448,10 +448,16 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
     A copy that was made while the store was written has such blocks, for instance.
     """
     missing: dict[int, str] = {}
-    for variable in store.variables:
-        keys = {store.chunk_key(variable.name, number): number for number in numbers}
-        for key in files.absent_files(store.storage, keys, f"{variable.name}/c"):
-            missing.setdefault(keys[key], key)
+    indices = {number: store.blocks.index(number) for number in numbers}
+
+    @functools.cache  # many variables have chunks of the same names
+    def numbered(template: str) -> dict[str, int]:
+        return {template.format(*index): number for number, index in indices.items()}
+
+    for variable, (template, _) in store.chunks.items():
+        names = numbered(template)
+        for name in names.keys() - files.list_folder(store.storage, variable):
+            missing.setdefault(names[name], f"{variable}/{name}")
     return missing
 
 
@@ -463,13 +469,17 @@ def check_whole(store: RunStore, *, finished: bool | None = None) -> set[int]:
     StoreError
         If receipts of a finished store, or chunks of committed blocks, are missing.
     """
+    # Asked first: the last blocks may be written, and the store closed, after blocks are listed.
+    finished = store.finished if finished is None else finished
     for _ in range(3):
-        done = committed(store)
-        missing = missing_chunks(store, done)
-        # A writer may have begun to compute a block again in between.
-        if not missing.keys() & committed(store):
+        listed = committed(store)
+        missing = missing_chunks(store, listed)
+        # A writer may have begun to compute a block again in between, and even committed it.
+        done = listed & committed(store) if missing else listed
+        missing = {number: key for number, key in missing.items() if number in done}
+        if not missing:
             break
-    if store.finished if finished is None else finished:
+    if finished:
         missing |= {number: receipt_key(number) for number in range(len(store.blocks))
                     if number not in done}
     if not missing:

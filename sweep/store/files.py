@@ -9,7 +9,7 @@ import os
 import stat
 import tempfile
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,8 @@ def read_files(storage: Store, keys: Sequence[str]) -> list[bytes | None]:
 
 def _read(path: str) -> bytes | None:
     try:
-        return Path(path).read_bytes()
+        with open(path, "rb", buffering=0) as file:  # noqa: PTH123  (twice as fast as a Path)
+            return file.read()
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return None
 
@@ -92,25 +93,11 @@ async def _delete(storage: Store, key: str) -> None:
         await storage.delete(key)
 
 
-def absent_files(storage: Store, keys: Iterable[str], folder: str) -> Iterator[str]:
-    """Yield the keys, of some below a folder, that are missing or empty."""
-    if not isinstance(storage, LocalStore):
-        present = set(list_files(storage, f"{folder}/"))
-        yield from (key for key in keys if key not in present)
-        return
-    root = os.fspath(storage.root)
-    for key in keys:
-        try:
-            size = os.stat(f"{root}/{key}").st_size  # noqa: PTH116  (one in 10^6)
-        except OSError:
-            size = 0
-        if not size:
-            yield key
-
-
 def list_folder(storage: Store, folder: str) -> list[str]:
     """Return the names in a folder of a storage; none if there is no such folder."""
-    with contextlib.suppress(FileNotFoundError):
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        if isinstance(storage, LocalStore):  # Zarr makes a path of each
+            return os.listdir(f"{storage.root}/{folder}")  # noqa: PTH208  (10^6 names a second)
         return [*collect_aiterator(storage.list_dir(folder))]
     return []
 
@@ -167,6 +154,10 @@ def check_folder_writable(folder: Path) -> None:
 
 #: Array of the blocks' receipts by number, JSON, a chunk each; empty unless committed.
 RECEIPTS = "commits/receipt"
+
+#: Between the indices in a chunk's name. Zarr's default makes folders of them; without folders, one
+#: listing tells which chunks of a variable there are.
+SEPARATOR = "."
 
 #: Level of the compression of every chunk.
 ZSTD_LEVEL = 3

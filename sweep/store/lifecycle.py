@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 # The layout of a store: its arrays, their metadata, and the values of its coordinates.
 
 #: Version of the layout of stores; another one is refused.
-FORMAT = 9
+FORMAT = 10
 
 
 class PlannedArray(NamedTuple):
@@ -82,6 +82,7 @@ def planned_files(planned: Iterable[PlannedArray]) -> dict[str, bytes]:
             dimension_names=each.dimensions, compressors=files.codecs(), attributes=each.attributes,
             # Also what equals the fill value (a tilt of 0): a missing chunk is a deleted one.
             config={"write_empty_chunks": True}, fill_value=each.fill,
+            chunk_key_encoding={"name": "default", "separator": files.SEPARATOR},
         )
         if each.values is not None:
             array[...] = each.values
@@ -462,8 +463,7 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
     store = open_store(path_of("store", url))
     import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
 
-    finished = store.finished
-    done = blocks.check_whole(store, finished=finished)
+    done = blocks.check_whole(store)
     small = store.pipeline.experiment.bytes_of(math.prod(store.blocks.lengths)) <= read_bytes
     try:
         with warnings.catch_warnings():
@@ -485,7 +485,7 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
         raise StoreError(
             f"{store.url}: damaged ({reason}); `sweep verify --repair` repairs it") from None
     dataset = dataset.assign_coords(loaded)
-    if not finished:
+    if len(done) < len(store.blocks):
         dataset = _only_committed(store, dataset, done)
     ordered = [
         each.name for each in (*schema.VARIABLES.values(), *schema.PHOTOGRAPH_SCHEMA)
@@ -508,6 +508,8 @@ def _only_committed(
     shown = shown[np.ix_(*(np.arange(length) // extent for extent, length in zip(
         store.blocks.extents, store.blocks.lengths, strict=True)))]
     mask = xr.DataArray(shown, dims=[axis.name for axis in store.pipeline.experiment.scene_axes])
+    if dataset.chunks:  # Dask would make chunks of it for each variable
+        mask = mask.chunk(_together(store))
     masked = {
         variable.name: dataset[variable.name].where(mask, variable.fill).astype(variable.dtype)
         for variable in store.variables

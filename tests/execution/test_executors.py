@@ -141,8 +141,8 @@ def test_children_end_with_their_client_whatever_ends_it(tmp_path):
             started([*run, "own.zarr", "--workers", 2], **options) as own,
         ):
             deadline = time.monotonic() + 120
-            while not (any(tmp_path.glob("long.zarr/commits/receipt/c/*"))
-                       and any(tmp_path.glob("own.zarr/commits/receipt/c/*"))):
+            while not (any(tmp_path.glob("long.zarr/commits/receipt/c.*"))
+                       and any(tmp_path.glob("own.zarr/commits/receipt/c.*"))):
                 assert time.monotonic() < deadline
                 time.sleep(0.1)
             children = psutil.Process(own.pid).children(recursive=True)

@@ -47,15 +47,15 @@ FAILED = Poison(12, "scene", "raise")
 RECEIPT = "commits/receipt/c"
 
 KINDS = {
-    "chunk": ("corner_error_px/c/0/0/0/0/0", 0),
-    "chunk of an edge block": ("translation_error_m/c/1/0/0/2/0", 5),
-    "chunk without numbers": ("nees/c/0/0/0/1", 1),
-    "chunk of flags": ("estimate/c/1/0/0/0", 3),
-    "receipt": (f"{RECEIPT}/2", 2),
-    "coordinate": ("side_px/c/0", None),
-    "coordinate that follows": ("distance_m/c/0", None),
-    "labels of an axis": ("solver/c/0", None),
-    "labels of a dimension": ("xyz/c/0", None),
+    "chunk": ("corner_error_px/c.0.0.0.0.0", 0),
+    "chunk of an edge block": ("translation_error_m/c.1.0.0.2.0", 5),
+    "chunk without numbers": ("nees/c.0.0.0.1", 1),
+    "chunk of flags": ("estimate/c.1.0.0.0", 3),
+    "receipt": (f"{RECEIPT}.2", 2),
+    "coordinate": ("side_px/c.0", None),
+    "coordinate that follows": ("distance_m/c.0", None),
+    "labels of an axis": ("solver/c.0", None),
+    "labels of a dimension": ("xyz/c.0", None),
     "metadata of a variable": ("detection/zarr.json", None),
     "metadata of a coordinate": ("trial/zarr.json", None),
     "metadata of labels": ("corner/zarr.json", None),
@@ -189,16 +189,16 @@ def test_store_whose_root_is_lost_is_run_again(change, copied):
 def test_sound_chunks_in_wrong_places_and_edited_ones_are_named(sound, copied, here, tmp_path):
     wanted = set()
     # Two exchanged.
-    one, other = (copied / f"rotation_error_deg/c/0/0/0/{k}" for k in (0, 1))
+    one, other = (copied / f"rotation_error_deg/c.0.0.0.{k}" for k in (0, 1))
     content = one.read_bytes()
     assert content != other.read_bytes()
     one.write_bytes(other.read_bytes())
     other.write_bytes(content)
-    wanted |= {(f"rotation_error_deg/c/0/0/0/{k}", k) for k in (0, 1)}
+    wanted |= {(f"rotation_error_deg/c.0.0.0.{k}", k) for k in (0, 1)}
     # A chunk and a receipt of another store.
     elsewhere = tmp_path / "other.zarr"
     by_hand(str(elsewhere), Pipeline.from_text(TEXT, ["seed=8"], name="small"), EXTENTS)
-    taken = {("corner_error_px/c/0/0/2/0/0", 2), (f"{RECEIPT}/3", 3)}
+    taken = {("corner_error_px/c.0.0.2.0.0", 2), (f"{RECEIPT}.3", 3)}
     for key, _ in taken:
         shutil.copy(elsewhere / key, copied / key)
     wanted |= taken
@@ -210,7 +210,7 @@ def test_sound_chunks_in_wrong_places_and_edited_ones_are_named(sound, copied, h
     wanted.add(("zarr.json", None))
 
     edit_values(copied, "marker_area_px", lambda values: values + (np.arange(5) == 4))
-    wanted |= {("marker_area_px/c/0/2", 2), ("marker_area_px/c/1/2", 5)}
+    wanted |= {("marker_area_px/c.0.2", 2), ("marker_area_px/c.1.2", 5)}
     assert named(verify(str(copied), 0)) == wanted
     see_repaired(copied, sound, wanted, here)
 
@@ -225,13 +225,12 @@ def test_unfinished_store_is_sound_and_goes_on_after_a_repair(pipeline, sound, t
         compute_block(str(url), store.run_id, store.blocks[number])
     # Two that a killed worker left: one begun, one torn.
     begin_block(store, store.blocks[1])
-    (url / "detection/c/0/0/2").parent.mkdir(parents=True, exist_ok=True)
-    (url / "detection/c/0/0/2").write_bytes(b"torn")
+    (url / "detection/c.0.0.2").write_bytes(b"torn")
     found = verify(str(url), 0)
     assert (found.damage, found.blocks_done) == ([], 3)
-    spoil(url / "true_rvec/c/1/0/0", random.Random(3))
-    (url / "xyz/c/0").unlink()
-    assert named(verify(str(url), 0)) == {("true_rvec/c/1/0/0", 3), ("xyz/c/0", None)}
+    spoil(url / "true_rvec/c.1.0.0", random.Random(3))
+    (url / "xyz/c.0").unlink()
+    assert named(verify(str(url), 0)) == {("true_rvec/c.1.0.0", 3), ("xyz/c.0", None)}
     mended = repair(str(url), 0)
     assert (mended.damage, here, mended.blocks_done) == ([], [], 2)
     for number in (3, 2, 4, 1):

@@ -13,7 +13,7 @@ them.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Unpack
 
 from sweep import experiment, library
@@ -82,7 +82,6 @@ def run(
     pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
     *,
     store: str | os.PathLike[str] | None = None,
-    progress: bool | Callable[[Progress], None] | None = None,
     **options: Unpack[RunOptions],
 ) -> xr.Dataset:
     """Run a pipeline into a store and return its results.
@@ -150,11 +149,10 @@ def run(
     {'side_px': 2, 'trial': 10}
     """
     # The child imports its packages while this process does.
-    with Child() as child, library.progress.progress_report(progress) as report:
+    with Child() as child:
         read = library.lifecycle.read_pipeline(pipeline)
         summary = library.runner.execute(
-            read, library.lifecycle.store_of(pipeline, store), progress=report, child=child,
-            **options)
+            read, library.lifecycle.store_of(pipeline, store), child=child, **options)
     notice(*summary.warnings)
     if summary.advice:
         notice(f"look at it: {summary.advice}")
@@ -196,7 +194,6 @@ def photos(
     stereo: str | os.PathLike[str] | None = None,
     settings: Sequence[str] = (),
     store: str | os.PathLike[str] | None = None,
-    progress: bool | Callable[[Progress], None] | None = None,
     **options: Unpack[RunOptions],
 ) -> xr.Dataset:
     """Measure detectors and estimators on photographs of known markers.
@@ -244,7 +241,7 @@ def photos(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, store=store,
         overwrite=options.get("overwrite", False))
     notice(*prepared.lines)
-    return run(prepared.pipeline, store=prepared.store, progress=progress, **options)
+    return run(prepared.pipeline, store=prepared.store, **options)
 
 
 def twins(
@@ -253,7 +250,6 @@ def twins(
     *,
     repeats: int = 1,
     store: str | os.PathLike[str] | None = None,
-    progress: bool | Callable[[Progress], None] | None = None,
     **options: Unpack[RunOptions],
 ) -> xr.Dataset:
     """Simulate the markers of photographs at their poses.
@@ -295,7 +291,7 @@ def twins(
     section = scene if isinstance(scene, Mapping) else library.prepare.read_scene(named, measured)
     return run(
         library.prepare.twin_pipeline(measured, section, repeats),
-        store=store or library.prepare.twin_store(photographs, named), progress=progress, **options)
+        store=store or library.prepare.twin_store(photographs, named), **options)
 
 
 def compare(
@@ -306,7 +302,6 @@ def compare(
     output: str | os.PathLike[str] | None = None,
     repeats: int = 1,
     store: str | os.PathLike[str] | None = None,
-    progress: bool | Callable[[Progress], None] | None = None,
     **options: Unpack[RunOptions],
 ) -> Findings:
     """Compare photographs with a simulation, or two stores of one pipeline.
@@ -354,7 +349,7 @@ def compare(
     library.lifecycle.open_finished(one)
     if other.endswith(".toml"):
         place = os.fspath(store or library.prepare.twin_store(one, other))
-        twins(one, other, repeats=repeats, store=place, progress=progress, **options)
+        twins(one, other, repeats=repeats, store=place, **options)
         other = place
     elif store is not None or repeats != 1:
         name, value = ("repeats", repeats) if store is None else ("store", store)

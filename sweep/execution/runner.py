@@ -73,7 +73,7 @@ def execute(
     retry_failed: bool = False,
     yes: bool = False,
     time_limit_s: float | None = None,
-    progress: ProgressReport | None = None,
+    progress: bool | ProgressReport | None = None,
     child: Child | None = None,
 ) -> SimpleNamespace:
     """Run a pipeline into a store; blocks that are committed there are not computed again.
@@ -105,7 +105,8 @@ def execute(
         Block timeout in seconds; the search for a scene that never returns keeps within it
         (default: 600, or ten times a block's work if that is more).
     progress
-        Called before the first block and after each one; a line says that code is compiled.
+        True for a display on stderr, or what is called before the first block and after each one;
+        a line says that code is compiled.
     child
         The process that measures scenes and computes small runs, if the caller started it earlier
         (`Child()`), so that it has imported its packages by now.
@@ -129,7 +130,8 @@ def execute(
     if retry_failed and reuse:
         raise errors.ArgumentError(
             "reuse", errors.path_of("reuse", reuse[0]), "expected no retry_failed beside it")
-    if progress is not None:
+    display = progress_report(progress)
+    if progress:
         announce_compilation(pipeline)
     url = errors.path_of("store", store) if store is not None else f"runs/{pipeline.name}.zarr"
     begun = _store_to_continue(url, pipeline, overwrite)
@@ -147,6 +149,7 @@ def execute(
         notice(f"{url}: another process is writing it, too: each of the two may compute a block")
 
     with contextlib.ExitStack() as stack:
+        progress = stack.enter_context(display)
         child = stack.enter_context(child or Child())
         check_plugins(child, pipeline)
         if begun is not None and done:
@@ -336,6 +339,7 @@ class RunOptions(TypedDict, total=False):
     retry_failed: bool
     yes: bool
     time_limit_s: float | None
+    progress: bool | ProgressReport | None
 
 
 def limit(
@@ -348,7 +352,6 @@ def limit(
     max_trials: int | None = None,
     settings: Sequence[str] = (),
     store: str | os.PathLike[str] | None = None,
-    progress: bool | ProgressReport | None = None,
     **options: Unpack[RunOptions],
 ) -> xr.Dataset:
     """Find how far along an axis requirements are met, and return the limits.
@@ -427,8 +430,7 @@ def limit(
         raise errors.ArgumentError(
             "along", along, f"expected one of {', '.join(names) or 'its axes'}")
     own = f"runs/{read.name}-limit-{searched}.zarr"
-    with progress_report(progress) as report:
-        summary = execute(read, own if store is None else store, progress=report, **options)
+    summary = execute(read, own if store is None else store, **options)
     notice(*summary.warnings)
     limits = requirement_limits(lifecycle.open_dataset(summary.store))
     return limits.assign_attrs(store=summary.store)

@@ -16,7 +16,7 @@ import numpy as np
 from sweep.analysis.dataset import DRAWS, computed_scenes
 from sweep.analysis.requirements import Answer, Decision, answers
 from sweep.errors import check_positive
-from sweep.execution.progress import ProgressReport, StageReport, progress_report, stage_display
+from sweep.execution.progress import StageReport, stage_display
 from sweep.execution.runner import RunOptions, execute
 from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
@@ -212,7 +212,6 @@ def size(
     *,
     store: str | os.PathLike[str] | None = None,
     limit_s: float = 20.0,
-    progress: bool | ProgressReport | None = None,
     **options: Unpack[RunOptions],
 ) -> Choice:
     """Search the smallest, or the cheapest, choice that meets requirements at all conditions.
@@ -253,13 +252,12 @@ def size(
     if rule is None or rule.kind not in CHOICES:
         example = 'smallest = "size_m", max_trials = 5000'
         raise refusal([f"{read.source}: expected what is chosen: [{SEARCH}] {example}"])
-    with progress_report(progress) as report:
-        summary = execute(read, store_of(pipeline, store), progress=report, **options)
+    summary = execute(read, store_of(pipeline, store), **options)
     results = open_dataset(summary.store)
     found = tuple(answers(results, rule, choice_shares(read, rule)))
     costs: Sequence[Cost | None] = [None] * len(found)
     if len(found) > 1 or read.budget_ms is not None:
-        with stage_display() if progress else contextlib.nullcontext() as stage:
+        with stage_display() if options.get("progress") else contextlib.nullcontext() as stage:
             costs = choice_costs(read, rule, found, limit_s, stage or (lambda _what, _share: None))
     trials = computed_scenes(results).sum(DRAWS).compute()
     notice(*summary.warnings)

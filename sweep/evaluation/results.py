@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import platform
 import traceback
@@ -21,6 +22,7 @@ from sweep.experiment.grid import Block, Grid
 from sweep.experiment.parameters import Stage
 from sweep.experiment.schema import SCHEMA, Tolerance, Variable
 from sweep.model.pose import rotation_of_vector
+from sweep.typing import Masks
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +132,34 @@ class CellsResult:
                 "estimation": [0.0] * grid.size(Stage.detection, Stage.estimation),
             },
         )
+
+
+    def take(
+        self, experiment: Experiment, part: CellsResult, rows: NDArray[np.intp], computed: Masks
+    ) -> None:
+        """Take over the results of some scenes.
+
+        Parameters
+        ----------
+        experiment
+            The experiment.
+        part, rows
+            The results of n scenes, and their numbers (n,) here.
+        computed
+            (n, detector settings, estimators) the cells that were computed, each as a whole.
+        """
+        where = {
+            Stage.scene: np.ones((1, len(rows)), dtype=bool),
+            Stage.detection: computed.any(axis=2).T,
+            Stage.estimation: computed.reshape(len(rows), -1).T,
+        }
+        for v in experiment.variables:
+            column, row = np.nonzero(where[v.stage])
+            self.columns[v.name][column, rows[row]] = part.columns[v.name][column, row]
+        for stage, seconds in part.seconds.items():
+            self.seconds[stage] = np.add(self.seconds[stage], seconds).tolist()
+        self.failures += [
+            dataclasses.replace(each, scene=int(rows[each.scene])) for each in part.failures]
 
 
 def to_dataset_layout(

@@ -300,15 +300,9 @@ def _computed(
     # Scenes of which every cell is reused are not rendered.
     rows = np.flatnonzero(need.any(axis=(1, 2)))
     if len(rows):
-        some = _compute(pipeline, block.indices(rows), need[rows], time_limit_s, isolated=isolated)
-        # A cell is computed or reused as a whole.
-        computed = {Stage.scene: np.ones((1, len(rows)), dtype=bool),
-                    Stage.detection: need[rows].any(axis=2).T,
-                    Stage.estimation: need[rows].reshape(len(rows), -1).T}
-        for v in experiment.variables:
-            column, row = np.nonzero(computed[v.stage])
-            cells.columns[v.name][column, rows[row]] = some.columns[v.name][column, row]
-        cells.seconds, cells.failures = some.seconds, some.failures
+        cells.take(experiment, _compute(
+            pipeline, block.indices(rows), need[rows], time_limit_s, isolated=isolated),
+            rows, need[rows])
         processors.add(processor())
     for v in experiment.variables:
         cells.columns[v.name][:, ~needed] = v.not_needed
@@ -323,7 +317,7 @@ def _computed(
         detection=flag_counts(DetectionStatus, values["detection"]),
         estimate=flag_counts(EstimateStatus, values["estimate"]),
         seconds=cells.seconds,
-        failures=blocks.recorded(pipeline, block, cells.failures, rows.tolist()),
+        failures=blocks.recorded(pipeline, block, cells.failures),
     )
 
 
@@ -335,7 +329,6 @@ def _compute(
 
     What raises is a result only if it raises again in another process.
     """
-    cells = None
     if not isolated:
         try:
             with ending_after(WHOLE * time_limit_s):
@@ -343,8 +336,8 @@ def _compute(
         except MachineFaultError:
             raise
         except Exception:
-            cells = None  # it raises as a whole, as single scenes may
-    if cells is None:
+            isolated = True  # it raises as a whole, as single scenes may
+    if isolated:
         cells = run_cells_isolated(pipeline, indices, need, time_limit_s)
     check_repeatable(pipeline, indices, need, cells, time_limit_s)
     return cells

@@ -61,17 +61,21 @@ BLOCK_TASK = "sweep.execution.block_task"
 
 
 class ChildError(Exception):
-    """A call in a child process has no result."""
+    """A call in a child process has no result.
+
+    Attributes
+    ----------
+    from_outside
+        Whether no scene's data can have ended the process: a signal of the system did, or the
+        call had not begun.
+    """
+
+    from_outside = False
 
     @property
     def line(self) -> str:
-        """The last line of the traceback."""
+        """The last line of the traceback, or how the process ended."""
         return str(self).strip().splitlines()[-1]
-
-    @property
-    def from_outside(self) -> bool:
-        """Whether the process was ended by a signal that no scene's data can cause."""
-        return str(self) in OUTSIDE_SIGNALS
 
 
 class ChildDiedError(ChildError):
@@ -81,19 +85,16 @@ class ChildDiedError(ChildError):
     ----------
     how
         How it ended: "SIGSEGV", "exit status 3", "time limit of 5 s".
+    begun
+        Whether the child had what the call needs: its packages, the arguments.
     timed_out
         Whether it ended because its time limit ran out.
     """
 
-    def __init__(self, how: str, *, timed_out: bool = False) -> None:
-        super().__init__(how)
-        self.timed_out = timed_out
-
-    @property
-    def line(self) -> str:
-        """How the process ended, of SIGKILL also what it may mean."""
-        memory = f", as where memory runs out: {ADVICE}" if str(self) == "SIGKILL" else ""
-        return f"its process ended: {self}{memory}"
+    def __init__(self, how: str, *, begun: bool = True, timed_out: bool = False) -> None:
+        memory = f", as where memory runs out: {ADVICE}" if how == "SIGKILL" else ""
+        super().__init__(f"its process ended: {how}{memory}")
+        self.from_outside, self.timed_out = not begun or how in OUTSIDE_SIGNALS, timed_out
 
 
 class ChildRaisedError(ChildError):
@@ -166,24 +167,26 @@ class Child:
         """
         if self._connection.closed:
             self._start()
-        started = time.monotonic()
+        started, begun = time.monotonic(), False
         # It bounds sending, too: a child that hangs while it imports reads nothing.
         last = threading.Timer(limit_s + grace_s, self._process.kill)
         last.start()
         try:
             self._connection.send((function, arguments, limit_s))
-            raised, result = self._connection.recv()
+            while (answer := self._connection.recv()) is None:
+                begun = True
         except (EOFError, OSError, pickle.UnpicklingError):
             took_s, code = time.monotonic() - started, self._process.wait()
             self.close()
             # The child ends itself with status 1 (`watchdog.ending_after`).
-            if took_s >= limit_s + (0.0 if code == 1 else grace_s):
-                raise ChildDiedError(f"time limit of {limit_s:.3g} s", timed_out=True) from None
-            how = f"exit status {code}" if code >= 0 else signal.Signals(-code).name
-            raise ChildDiedError(how) from None
+            timed_out = took_s >= limit_s + (0.0 if code == 1 else grace_s)
+            how = f"time limit of {limit_s:.3g} s" if timed_out else (
+                f"exit status {code}" if code >= 0 else signal.Signals(-code).name)
+            raise ChildDiedError(how, begun=begun, timed_out=timed_out) from None
         finally:
             last.cancel()
             last.join()
+        raised, result = answer
         if raised:
             raise result if isinstance(result, SweepError) else ChildRaisedError(result)
         return cast("Result", result)
@@ -220,6 +223,7 @@ def serve(module: str, descriptor: str) -> None:
         while request := connection.recv_bytes():
             try:
                 function, arguments, limit_s = pickle.loads(request)  # noqa: S301  (the parent's)
+                connection.send(None)
                 with ending_after(limit_s):
                     answer = (False, function(*arguments))
             except SweepError as error:

@@ -1,10 +1,13 @@
-"""The cell that ends its process is found: blocks are cut until one scene is left."""
+"""The cell that ends its process is found: blocks are cut until one cell is left."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
+import math
 import time
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,17 +18,18 @@ from sweep.evaluation.block import run_cells
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure
+from sweep.evaluation.variables import WITHOUT_DETECTION
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Child, ChildDiedError, ChildError, ChildRaisedError
+from sweep.isolation.child_process import Child, ChildDiedError, ChildError
 from sweep.measure.detectors import PluginSetting, make_detector
 from sweep.measure.estimators import build
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import local_fault
 from sweep.store.blocks import selected
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
-# Scenes that crash their process or never return, isolated in child processes.
+# Cells that crash their process or never return, isolated in child processes.
 #
 # The rest of the block is computed all the same. Of a block's time limit, its worker has a quarter,
 # before that ends itself (:data:`WHOLE`). Then each call in a child has a share of what is left
@@ -35,155 +39,30 @@ from sweep.typing import Masks
 
 WHOLE, SHARE, LEAST = 1 / 4, 1 / 6, 1 / 32
 
-#: How many fresh processes a part of a scene must end, one after another, to be flagged.
+#: How many fresh processes the cells of a scene must end, each alone, before one is flagged.
 DEATHS = 3
 
 #: Least time limit of a call.
 MIN_S = 1.0
 
 #: How long a child may take to start and to unpickle the pipeline.
-HOLD_S = 300.0
+START_S = 300.0
 
-#: Into how many pieces a group of scenes is cut that crashed a process.
+#: Into how many pieces cells are cut that crashed a process together.
 PIECES = 64
 
-#: In the child: the pipeline whose cells are computed.
-_held: list[Pipeline] = []
+
+def _run(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: Masks) -> CellsResult:
+    return run_cells(pipeline.experiment, indices, need)
 
 
-def _hold(pipeline: Pipeline) -> None:
-    _held[:] = [pipeline]
-
-
-def _run_held(
-    indices: Sequence[NDArray[np.intp]], need: Masks, search_too: Masks | None = None
-) -> CellsResult:
-    return run_cells(_held[0].experiment, indices, need, search_too)
-
-
-class _IsolatedCells:
-    """Computes cells of a pipeline in a child process, which begins again after a crash.
-
-    ``cells`` are what has been computed so far; the other arguments are as in
-    :func:`run_cells_isolated`.
-    """
-
-    def __init__(
-        self, child: Child, pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: Masks,
-        limit_s: float,
-    ) -> None:
-        self._child, self._pipeline, self._indices, self._need = child, pipeline, indices, need
-        self._limit_s, self._end = limit_s, time.monotonic() + (1 - WHOLE) * limit_s
-        self.cells = CellsResult.not_run(pipeline.experiment, len(need))
-        self._begin()
-
-    def _begin(self) -> None:
-        """Give a fresh child the pipeline; MachineFaultError if it ends meanwhile."""
-        try:
-            self._child.call(_hold, self._pipeline, limit_s=HOLD_S)
-        except ChildError as error:
-            raise local_fault(f"a child process computed nothing: {error.line}") from None
-
-    def compute(self, rows: NDArray[np.intp]) -> None:
-        """Compute scenes ``rows`` (n,) in pieces; those that end the process in smaller ones."""
-        for piece in np.array_split(rows, min(PIECES, len(rows))):
-            try:
-                self._take(piece, self._run(piece, self._need[piece]))
-            except ChildError:
-                if len(piece) > 1:
-                    self.compute(piece)
-                else:
-                    self._compute_scene(int(piece[0]))
-
-    def _run(self, rows: NDArray[np.intp], *masks: Masks) -> CellsResult:
-        """Call ``run_cells`` for some scenes.
-
-        Raises
-        ------
-        ChildDiedError, ChildRaisedError
-            If the child crashed, ran out of time, or raised.
-        MachineFaultError
-            If a child cannot be started, or raises what no scene's data can cause.
-        """
-        limit_s = max(SHARE * (self._end - time.monotonic()), LEAST * self._limit_s, MIN_S)
-        try:
-            return self._child.call(
-                _run_held, [index[rows] for index in self._indices], *masks, limit_s=limit_s)
-        except ChildDiedError:
-            self._begin()
-            raise
-
-    def _take(
-        self, rows: NDArray[np.intp], part: CellsResult, stage: str = "",
-        number: int | slice = slice(None),
-    ) -> None:
-        """Take over the results of scenes: all, or those of one configuration of a stage."""
-        for variable in self._pipeline.experiment.variables:
-            if stage in ("", variable.stage.name):
-                self.cells.columns[variable.name][number, rows] = (
-                    part.columns[variable.name][number])
-        for name, seconds in part.seconds.items():
-            if stage in ("", name):
-                self.cells.seconds[name] = np.add(self.cells.seconds[name], seconds).tolist()
-        self.cells.failures += [
-            dataclasses.replace(each, scene=int(rows[each.scene])) for each in part.failures
-            if stage in ("", each.stage)]
-
-    def _compute_scene(self, row: int) -> None:
-        """Compute a scene that crashes its process, never returns, or raises.
-
-        Its parts are computed one after another, each in addition to those that it depends on:
-        rendering, each detector setting, each estimator. The results of those that work are taken
-        over, the others are flagged.
-        """
-        flags, need = self.cells.columns, self._need[row]
-        unseen = self._lost(Failure(row, "scene", ""))
-        for k in np.flatnonzero(need.any(axis=1)).tolist():
-            lost = unseen or self._lost(Failure(row, "detection", "", k), k)
-            if lost:
-                flags["detection"][k][row] = DetectionStatus[lost]
-            for j in np.flatnonzero(need[k]).tolist():
-                number = k * need.shape[1] + j
-                unsolved = "no_detection" if lost else self._lost(
-                    Failure(row, "estimation", "", k, j), number)
-                if unsolved:
-                    flags["estimate"][number][row] = EstimateStatus[unsolved]
-                    flags["flipped"][number][row] = Flipped.no_estimate
-
-    def _lost(self, part: Failure, number: int = 0) -> str:
-        """Compute a part of a scene, named as its failure would be; take over its results.
-
-        Returns
-        -------
-        "crashed" or "failed" if there are none, which is noted; nothing otherwise.
-
-        Raises
-        ------
-        MachineFaultError
-            If a process is ended by a signal from outside.
-        """
-        need = np.zeros_like(self._need[:1])
-        search = np.zeros_like(need[..., 0])
-        if part.estimator is not None:
-            need[0, part.setting, part.estimator] = True
-        elif part.setting is not None:
-            search[0, part.setting] = True
-        row, lost = np.array([part.scene]), part
-        for _ in range(DEATHS):
-            try:
-                self._take(row, self._run(row, need, search), part.stage, number)
-            except ChildRaisedError as error:
-                lost = dataclasses.replace(part, text=str(error))
-                break
-            except ChildDiedError as death:
-                if death.from_outside:
-                    at = selected(self._pipeline, [int(i[part.scene]) for i in self._indices], part)
-                    raise local_fault(f"{death.line}; the scene is --at {at}") from None
-                lost = dataclasses.replace(part, text=death.line, crashed=True)
-            else:
-                return ""
-        self.cells.failures.append(lost)
-        return "crashed" if lost.crashed else "failed"
+def _pieces(cells: NDArray[np.intp], configurations: int) -> list[NDArray[np.intp]]:
+    """Cut cells, by their numbers in order, into whole scenes; those of one scene into cells."""
+    units = np.split(cells, np.flatnonzero(np.diff(cells // configurations)) + 1)
+    if len(units) == 1:
+        units = np.split(cells, len(cells))
+    size = math.ceil(len(units) / PIECES)
+    return [np.concatenate(units[k : k + size]) for k in range(0, len(units), size)]
 
 
 @machine_faults_raised()
@@ -195,10 +74,11 @@ def run_cells_isolated(
 ) -> CellsResult:
     """Compute cells as `sweep.evaluation.block.run_cells` does, also if they crash their process.
 
-    A detection or estimate that ends each of :data:`DEATHS` child processes is flagged ``crashed``,
-    one that raises ``failed``. A signal from outside, such as the system sends to a process that
-    uses too much memory, is the machine's fault. All others have the same values as in one call,
-    bit for bit: what worked alone does not depend on what else its scene has.
+    A cell that ends each of :data:`DEATHS` child processes is flagged ``crashed``, one that raises
+    as a whole ``failed``: its detection if no other estimate of that worked, else the estimate. A
+    signal from outside, such as the system sends to a process that uses too much memory, is the
+    machine's fault. All other cells have the same values as in one call, bit for bit: what worked
+    alone does not depend on what else its scene has.
 
     Parameters
     ----------
@@ -215,12 +95,64 @@ def run_cells_isolated(
     ------
     MachineFaultError
         If no child process can be started, one raises what no scene's data can cause, or one that
-        computes a single scene is ended by a signal from outside.
+        computes a single cell is ended by a signal from outside.
     """
+    end = time.monotonic() + (1 - WHOLE) * limit_s
+    result = CellsResult.not_run(pipeline.experiment, len(need))
+    lost: dict[tuple[int, int, int], Failure] = {}
+    ended = Counter[int]()  # scene -> calls without a result for one of its cells alone
+
+    def run(rows: NDArray[np.intp], wanted: Masks) -> None:
+        """Compute the ``wanted`` cells of scenes ``rows`` (n,); take over their results."""
+        share_s = max(SHARE * (end - time.monotonic()), LEAST * limit_s, MIN_S)
+        part = child.call(_run, pipeline, [index[rows] for index in indices], wanted[rows],
+                          limit_s=share_s, grace_s=START_S)
+        result.take(pipeline.experiment, part, rows, wanted[rows])
+
+    def compute(cells: NDArray[np.intp]) -> None:
+        """Compute cells by their numbers; those that end the process in smaller pieces."""
+        for piece in _pieces(cells, need[0].size):
+            wanted = np.zeros_like(need)
+            wanted.flat[piece] = True
+            try:
+                run(np.unique(piece // need[0].size), wanted)
+            except ChildError as error:
+                if len(piece) > 1:
+                    compute(piece)
+                    continue
+                died = isinstance(error, ChildDiedError)
+                row, k, j = (int(at) for at in np.argwhere(wanted)[0])
+                failure = Failure(row, "estimation", str(error), k, j, crashed=died)
+                ended[row] += 1
+                if error.from_outside:
+                    at = selected(pipeline, [int(index[row]) for index in indices], failure)
+                    raise local_fault(f"{error.line}; the scene is --at {at}") from None
+                if died and ended[row] < DEATHS:
+                    compute(piece)
+                else:
+                    lost[row, k, j] = failure
+
     with Child() as child:
-        isolated = _IsolatedCells(child, pipeline, indices, need, limit_s)
-        isolated.compute(np.arange(len(need)))
-        return isolated.cells
+        compute(np.flatnonzero(need))
+        for row in ended:
+            with contextlib.suppress(ChildError):  # its parameters and truth
+                run(np.array([row]), np.zeros_like(need))
+    flags = result.columns
+    unseen = flags["detection"] == DetectionStatus.not_run
+    for (row, k, j), failure in lost.items():
+        kind, number = "crashed" if failure.crashed else "failed", k * need.shape[2] + j
+        for name, flag in WITHOUT_DETECTION.items():
+            flags[name][number, row] = flag
+        if unseen[k, row]:
+            flags["detection"][k, row] = DetectionStatus[kind]
+            result.failures.append(dataclasses.replace(failure, stage="detection", estimator=None))
+        else:
+            flags["estimate"][number, row] = EstimateStatus[kind]
+            result.failures.append(failure)
+    # Cells that were computed apart tell the same of what they share.
+    result.failures = list({
+        dataclasses.replace(each, text=""): each for each in result.failures}.values())
+    return result
 
 
 # --------------------------------------------------------------------------------------------------

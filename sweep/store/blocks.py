@@ -261,17 +261,14 @@ MAX_CHARACTERS = 4000
 
 
 def recorded(
-    pipeline: Pipeline, block: Block, failures: Sequence[Any], rows: Sequence[int]
+    pipeline: Pipeline, block: Block, failures: Sequence[Any]
 ) -> tuple[FailedCell, ...]:
-    """Return the failures that a block's receipt keeps.
-
-    ``rows`` gives the number within the block of each scene that was computed.
-    """
+    """Return the failures that a block's receipt keeps."""
     kept: list[FailedCell] = []
     for kind in ("failed", "crashed"):
         some = (each for each in failures if each.crashed == (kind == "crashed"))
         kept += (
-            FailedCell(selected(pipeline, block.cell(rows[each.scene]), each), kind, each.stage,
+            FailedCell(selected(pipeline, block.cell(each.scene), each), kind, each.stage,
                        each.text[-MAX_CHARACTERS:])
             for each in itertools.islice(some, MAX_PER_BLOCK))
     return tuple(kept)

@@ -173,15 +173,10 @@ class Executor(ABC):
 # --------------------------------------------------------------------------------------------------
 # Child processes of this machine, each called by a thread.
 
-#: Work up to which a run needs one process: another takes a second to import its packages.
-SMALL_RUN_S = 3.0
-
-#: Seconds after which the other processes are started if such a run still goes on.
-SMALL_RUN_LIMIT_S = 10.0
-
-
 class Children(Executor):
     """Computes blocks in child processes.
+
+    With a line, fewer do than were asked for if the system allows no more.
 
     Parameters
     ----------
@@ -189,18 +184,20 @@ class Children(Executor):
         The first one.
     count
         How many there are to be.
-    at_once
-        Whether the others are started now; else they are after :data:`SMALL_RUN_LIMIT_S`.
     """
 
-    def __init__(self, child: Child, count: int, *, at_once: bool) -> None:
-        self.threads = count if at_once else 1
-        self._count, self._children = count, [child]
-        self._idle = SimpleQueue[Child]()
-        self._idle.put(child)
-        self._pool = ThreadPoolExecutor(count)
-        self._grow_at = time.monotonic() + (0.0 if at_once else SMALL_RUN_LIMIT_S)
-        self.room()
+    def __init__(self, child: Child, count: int) -> None:
+        self._children, self._idle = [child], SimpleQueue[Child]()
+        try:
+            while len(self._children) < count:
+                self._children.append(Child())
+        except OSError as error:
+            notice(f"{len(self._children)} of {count} processes could be started: "
+                   f"{exception_line(error)}")
+        for each in self._children:
+            self._idle.put(each)
+        self.threads = len(self._children)
+        self._pool = ThreadPoolExecutor(self.threads)
 
     def __enter__(self) -> Self:
         return self
@@ -214,24 +211,12 @@ class Children(Executor):
             child.close()
 
     def room(self) -> int:
-        """Return the number of processes; start those that are due.
-
-        With a line, fewer go on if the system allows no more.
-        """
-        while len(self._children) < self._count and time.monotonic() >= self._grow_at:
-            try:
-                self._children.append(Child())
-            except OSError as error:
-                notice(f"{len(self._children)} of {self._count} processes could be started: "
-                       f"{exception_line(error)}")
-                self._count = len(self._children)
-            else:
-                self._idle.put(self._children[-1])
-        return len(self._children)
+        """Return the number of processes."""
+        return self.threads
 
     def workers(self) -> str:
         """Return how many processes there are."""
-        return f"{len(self._children)} processes"
+        return f"{self.threads} processes"
 
     def submit(self, arguments: tuple[Any, ...], _failures: list[Failed]) -> Any:
         """Have a thread call a child that is idle."""

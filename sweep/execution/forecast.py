@@ -6,10 +6,8 @@ import contextlib
 import math
 import resource
 import shutil
-import statistics
 import time
 from collections.abc import Sequence
-from collections.abc import Set as AbstractSet
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -19,15 +17,13 @@ import numpy as np
 from sweep.errors import MachineFaultError, check_positive
 from sweep.evaluation.block import run_cells
 from sweep.execution import TIME_LIMIT_S
-from sweep.execution.executors import SMALL_RUN_S
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, default_workers
+from sweep.isolation.child_process import Child, ChildError, default_workers
 from sweep.isolation.watchdog import compilation_s
 from sweep.messages import byte_count, duration
 from sweep.sampling.rules import Stopping, block_unit, make_rule
-from sweep.store.blocks import RunStore, receipts
 from sweep.store.locations import is_remote
 
 # --------------------------------------------------------------------------------------------------
@@ -119,21 +115,19 @@ def measure(child: Child, pipeline: Pipeline, limit_s: float = TIMING_LIMIT_S) -
     """
     try:
         return child.call(timed, pipeline, limit_s=limit_s, grace_s=COMPILATION_LIMIT_S)
-    except (ChildRaisedError, MachineFaultError):
-        return Timing(UNMEASURED_S, 0)
-    except ChildDiedError as error:
-        return Timing(limit_s, 1, over=True) if error.timed_out else Timing(UNMEASURED_S, 0)
+    except (ChildError, MachineFaultError) as error:
+        over = isinstance(error, ChildError) and error.timed_out
+        return Timing(limit_s, 1, over=True) if over else Timing(UNMEASURED_S, 0)
 
 
-#: Committed blocks from which the cost of a scene is estimated.
-SAMPLED_RECEIPTS = 100
+#: Work up to which a run needs one process: another takes a second to import its packages.
+SMALL_RUN_S = 3.0
 
 
-def timing_of(store: RunStore, done: AbstractSet[int]) -> Timing:
-    """Return the cost of a scene of some committed blocks; assumed if there are none."""
-    some = sorted(done)[:SAMPLED_RECEIPTS]
-    spent = [receipt.wall_s / receipt.scenes for _, receipt in receipts(store, some)]
-    return Timing(statistics.fmean(spent or [BLOCK_S / len(store.blocks[0])]), len(spent))
+def process_count(pipeline: Pipeline, timing: Timing, workers: int | None) -> int:
+    """Return how many processes of this machine compute a run: as asked, else by its work."""
+    small = timing.sampled and pipeline.size(Stage.scene) * timing.pose_s < SMALL_RUN_S
+    return workers or (1 if small else default_workers())
 
 
 # --------------------------------------------------------------------------------------------------
@@ -286,12 +280,10 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
     check_positive("workers", workers, "expected at least 1", whole=True)
     with Child() as child:
         timing = measure(child, pipeline, PLAN_S)
-    least = least_share(make_rule(pipeline)) * pipeline.size(Stage.scene) * timing.pose_s
-    here = default_workers()
-    count = workers or (1 if least < SMALL_RUN_S else here)
+    count = process_count(pipeline, timing, workers)
     blocks = blocks_of(pipeline, timing.pose_s, count)
     expected = forecast_of(
-        f"runs/{pipeline.name}.zarr", pipeline, timing, blocks, min(count, here))
+        f"runs/{pipeline.name}.zarr", pipeline, timing, blocks, min(count, default_workers()))
     expected.workers = count
     return expected
 

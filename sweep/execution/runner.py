@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from sweep import compilation, errors
 from sweep.execution import forecast, status
-from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
+from sweep.execution.executors import Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport, progress_report
 from sweep.execution.waves import InWaves
 from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import NO_TRIALS, search_settings
-from sweep.isolation.child_process import Child, Interrupts, default_workers
+from sweep.isolation.child_process import Child, Interrupts
 from sweep.isolation.crash_isolation import check_plugins
 from sweep.messages import notice
 from sweep.sampling.rules import make_rule
@@ -86,7 +86,7 @@ def execute(
         Path or URL of the store (default: ``runs/NAME.zarr``).
     workers
         Processes on this machine (default: the available processors, or a single one where less
-        than :data:`SMALL_RUN_S` seconds of work are left).
+        than :data:`sweep.execution.forecast.SMALL_RUN_S` seconds of work are predicted).
     scheduler
         Address of a running Dask scheduler, whose workers compute instead: they must reach the
         store under the same path. Or ``local``: a Dask cluster on this machine, for this run.
@@ -121,7 +121,7 @@ def execute(
         If blocks failed; the others are in the store, and another run continues.
     """
     started = time.perf_counter()
-    rule = make_rule(pipeline)  # it refuses names that it does not know
+    make_rule(pipeline)  # it refuses names that it does not know
     errors.check_positive("workers", workers, "expected at least 1", whole=True)
     if scheduler is not None and client is not None:
         raise errors.ArgumentError("scheduler", scheduler, "expected no client beside it")
@@ -152,13 +152,7 @@ def execute(
         progress = stack.enter_context(display)
         child = stack.enter_context(child or Child())
         check_plugins(child, pipeline)
-        if begun is not None and done:
-            timing = forecast.timing_of(begun, done)
-            left = 1 - len(done) / len(begun.blocks)
-        else:
-            timing = forecast.measure(child, pipeline)
-            # In waves, nobody knows how much more than the first one is needed.
-            left = forecast.least_share(rule)
+        timing = forecast.measure(child, pipeline)
         interrupts = stack.enter_context(Interrupts())
         executor: Executor
         if scheduler is not None or client is not None:
@@ -166,9 +160,8 @@ def execute(
 
             executor = stack.enter_context(connected(pipeline, scheduler, client, workers))
         else:
-            large = left * pipeline.size(Stage.scene) * timing.pose_s >= SMALL_RUN_S
             executor = stack.enter_context(Children(
-                child, workers or default_workers(), at_once=large or workers is not None))
+                child, forecast.process_count(pipeline, timing, workers)))
         cut = begun.blocks if begun is not None else forecast.blocks_of(
             pipeline, timing.pose_s, executor.threads, time_limit_s)
         expected = forecast.forecast_of(
@@ -186,13 +179,11 @@ def execute(
         limit_s = forecast.block_time_limit_s(time_limit_s, timing.pose_s * len(begun.blocks[0]))
         try:
             computed = compute(begun, executor, sources, limit_s, interrupts, progress)
-        except errors.StoreReplacedError as error:
-            raise errors.RunError(str(error)) from None
         except (errors.RunError, errors.StoreError) as error:
             first, *others = str(error).splitlines()
-            without = " without overwrite" if overwrite else ""
-            advice = f"{first}; run it again{without} to continue"
-            raise errors.RunError("\n".join([advice, *others])) from None
+            if not isinstance(error, errors.StoreReplacedError):
+                first += f"; run it again{' without overwrite' if overwrite else ''} to continue"
+            raise errors.RunError("\n".join([first, *others])) from None
     return status.summary_of(
         lifecycle.open_store(url), computed, time.perf_counter() - started, again)
 
@@ -284,14 +275,17 @@ def compute(
             blocks.drop_block(store, store.blocks[number])
         done -= missing.keys()
         waves = None if pipeline.stopping is None else InWaves(store)
-        totals, counted = status.Totals(), set[int]()
+        totals = status.Totals()
+        for _, receipt in blocks.receipts(store, done if waves is None else ()):
+            totals.add(receipt)
         left = ((number, None) for number in range(len(store.blocks)) if number not in done)
         for wave in waves or [left]:
-            # Later blocks than one that was computed again hold if its results are as before.
-            for number, receipt in blocks.receipts(
-                    store, (done if waves is None else waves.current) - counted):
-                totals.add(receipt)
-                counted.add(number)
+            if waves is not None:
+                # Later blocks than one that was computed again hold if its results are as before.
+                known = waves.current.values()
+                totals = status.Totals(
+                    sum(each.scenes for each in known), sum(each.needed for each in known),
+                    Counter(detected=sum(each.detected for each in known)))
             report()
             tasks = (
                 (number, (url, store.run_id, store.blocks[number], sources, time_limit_s, decision))
@@ -300,14 +294,13 @@ def compute(
             with contextlib.closing(executor.map(tasks, time_limit_s, interrupts)) as results:
                 for number, result in results:
                     if isinstance(result, Failed):
-                        reason = f"block {store.blocks[number]}: {result.reason}"
-                        failed.append(result._replace(reason=reason))
+                        failed.append(result._replace(
+                            reason=f"block {store.blocks[number]}: {result.reason}"))
                         if len(failed) >= MAX_FAILED_BLOCKS:
                             break
                         continue
                     if waves is not None:
                         waves.committed(number, result)
-                        counted.add(number)
                     computed.update({"blocks": 1, **result.computed})
                     totals.add(result)
                     report()

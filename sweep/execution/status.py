@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,10 +22,6 @@ from sweep.store import blocks
 from sweep.store.blocks import FailedCell, Receipt, RunStore
 from sweep.store.lifecycle import open_store, write_groups
 from sweep.store.lock import is_written
-
-if TYPE_CHECKING:
-    import xarray as xr
-
 
 # --------------------------------------------------------------------------------------------------
 # Totals of a store's receipts.
@@ -64,7 +60,10 @@ class Totals:
         self.processors.update(receipt.processors)
         self.detection.update(receipt.detection)
         self.estimate.update(receipt.estimate)
-        for cell in receipt.failures:
+        self._list(receipt.failures)
+
+    def _list(self, failures: Iterable[FailedCell]) -> None:
+        for cell in failures:
             if len(self.lost[cell.kind]) < MAX_ROWS:
                 self.lost[cell.kind].append(cell)
 
@@ -82,17 +81,10 @@ class Totals:
             needed=counts.get("sampled", {}).get("needed", 0),
             detection=Counter(counts["detection"]), estimate=Counter(counts["estimate"]),
             processors=Counter(counts["processors"]))
-        if any(lost_counts(totals).values()):
-            listing = Totals()
-            for _, receipt in blocks.receipts(store, blocks.committed(store)):
-                listing.add(receipt)
-            totals.lost = listing.lost
+        some = blocks.committed(store) if any(lost_counts(totals).values()) else ()
+        for _, receipt in blocks.receipts(store, some):
+            totals._list(receipt.failures)
         return totals
-
-    @property
-    def cells(self) -> list[FailedCell]:
-        """The listed cells, those that failed first."""
-        return self.lost["failed"] + self.lost["crashed"]
 
 
 def lost_counts(counted: Totals | Receipt) -> dict[str, int]:
@@ -111,12 +103,6 @@ LOUD_SHARE = 0.1
 MAX_GROUPS = 5
 
 MAX_REASON = 200
-
-#: Flags of cells on which a stage was not tried.
-NOT_TRIED = (
-    "not_run", "no_detection", DetectionStatus.not_visible.name, DetectionStatus.not_modelled.name,
-    DetectionStatus.not_needed.name,
-)
 
 #: Parts of messages that differ from cell to cell: addresses and numbers.
 _VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d[\d_,]*(?:\.\d*)?(?:[eE][-+]?\d+)?")
@@ -159,11 +145,16 @@ def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
     first
         A cell to look at where nothing was detected, as ``--at`` takes it.
     """
-    groups, advice = failure_groups(totals.cells), ""
+    groups, nothing, advice = failure_groups(
+        totals.lost["failed"] + totals.lost["crashed"]), "", ""
     shares, warnings = [0.0], list[str]()
-    for cells, flags in (("detections", totals.detection), ("estimates", totals.estimate)):
-        lost = {kind: flags[kind] for kind in ("failed", "crashed") if flags[kind]}
-        tried = flags.total() - sum(flags[name] for name in NOT_TRIED)
+    stages: tuple[tuple[type[Flag], Counter[str], str, str], ...] = (
+        (DetectionStatus, totals.detection, "detections", "nothing was detected"),
+        (EstimateStatus, totals.estimate, "estimates", "no pose was estimated"))
+    for flags, counts, cells, none_present in stages:
+        lost = {kind: counts[kind] for kind in ("failed", "crashed") if counts[kind]}
+        tried = sum(count for name, count in counts.items()
+                    if flags[name].counted and name != "no_detection")
         share = sum(lost.values()) / max(tried, 1)
         shares.append(share)
         if share == 1.0:
@@ -172,13 +163,18 @@ def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
             listed = " and ".join(f"{count:,} {kind}" for kind, count in lost.items())
             warnings.append(f"{'warning: ' if share > LOUD_SHARE else ''}{listed} of "
                             f"{tried:,} {cells} ({100 * share:.4g} %)")
+        needed = Counter({name: count for name, count in counts.items() if name != "not_needed"})
+        if needed and not nothing and not any(flags[name].present for name in needed):
+            ((name, count),) = needed.most_common(1)
+            nothing = (f"warning: {none_present}: {count:,} {name} "
+                       f"({flags[name].meaning.rstrip('.')})")
     shown, others = groups[:MAX_GROUPS], groups[MAX_GROUPS:]
     warnings += [f"  {group['count']:,} x {group['kind']} in {group['stage']}: {group['reason']}"
                  for group in shown]
     if others:
         rest = sum(group["count"] for group in others)
         warnings.append(f"  {rest:,} x for {len(others):,} other reasons")
-    nothing = "" if 1.0 in shares else _nothing_found(totals)
+    nothing = "" if 1.0 in shares else nothing
     if groups or nothing:
         places = [group["at"] for group in shown] if groups else [first]
         words = [word for at in places if at for word in ("--at", at)]
@@ -189,27 +185,14 @@ def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
             "failures": groups, "warnings": warnings, "advice": advice}
 
 
-def _nothing_found(totals: Totals) -> str:
-    """Return a line that says that nothing was detected, or no pose estimated; or nothing."""
-    stages: tuple[tuple[type[Flag], Counter[str], str], ...] = (
-        (DetectionStatus, totals.detection, "nothing was detected"),
-        (EstimateStatus, totals.estimate, "no pose was estimated"))
-    for flags, counts, what in stages:
-        needed = Counter({name: count for name, count in counts.items() if name != "not_needed"})
-        if needed and not any(flags[name].present for name in needed):
-            ((name, count),) = needed.most_common(1)
-            return f"warning: {what}: {count:,} {name} ({flags[name].meaning.rstrip('.')})"
-    return ""
-
-
 # --------------------------------------------------------------------------------------------------
-# Closing a complete store: tables of costs and failures, and counts of flags.
+# Closing a complete store: a table of costs, and counts of flags.
 
 def close(store: RunStore) -> None:
     """Close a store of which every block is committed.
 
-    Its receipts are summed up in the groups ``cost`` and ``failures``, which may be empty; then it
-    is marked finished.
+    Its receipts are summed up in the group ``cost``, seconds of each block per stage and
+    configuration, and in counts; then it is marked finished.
 
     Raises
     ------
@@ -226,26 +209,6 @@ def close(store: RunStore) -> None:
         name: getattr(totals, name) for name in ("detection", "estimate", "processors")}
     if (rule := store.pipeline.stopping) is not None:
         counts["sampled"] = {"needed": totals.needed, "unsettled": unsettled_count(store, rule)}
-    write_groups(store, {"cost": _cost(store, costs), "failures": _failure_table(totals)}, counts)
-
-
-def _failure_table(totals: Totals) -> xr.Dataset:
-    """Return the table of failures, with the total number of cells of each kind."""
-    import xarray as xr  # noqa: PLC0415  (slow to import)
-
-    return xr.Dataset(
-        {name: ("failure", np.array([getattr(cell, name) for cell in totals.cells], dtype=object))
-         for name in ("at", "kind", "stage", "text")},
-        attrs={
-            "long_name": "scenes that raised or ended their process",
-            "rows_kept": f"at most {MAX_ROWS} of each kind, and {blocks.MAX_PER_BLOCK} of a block",
-            **{f"{kind}_cells": count for kind, count in lost_counts(totals).items()},
-        },
-    )
-
-
-def _cost(store: RunStore, costs: Mapping[int, Mapping[str, Sequence[float]]]) -> xr.Dataset:
-    """Return the cost group: seconds of each block per stage and configuration."""
     import xarray as xr  # noqa: PLC0415  (slow to import, and often not needed)
 
     settings = store.pipeline.axes_of(Stage.detection)
@@ -258,8 +221,9 @@ def _cost(store: RunStore, costs: Mapping[int, Mapping[str, Sequence[float]]]) -
     }
     # Lists: xarray supports NumPy's strings of variable length in parts.
     coordinates = {axis.name: axis.coordinates().tolist() for axis in both}
-    return xr.Dataset(seconds, {"block": list(costs), **coordinates},
+    cost = xr.Dataset(seconds, {"block": list(costs), **coordinates},
                       {"long_name": "seconds per stage and treatment for each block"})
+    write_groups(store, {"cost": cost}, counts)
 
 
 # --------------------------------------------------------------------------------------------------

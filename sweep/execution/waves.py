@@ -20,13 +20,14 @@ from sweep.store.blocks import Receipt, RunStore, committed, receipts
 Work = tuple[int, Decision | None]
 
 
-class _Known(NamedTuple):
+class Known(NamedTuple):
     """The kept part of a committed block's receipt; ``content`` is a digest of what rules read."""
 
     basis: int | None
     content: int
     needed: int
     scenes: int
+    detected: int
 
 
 class InWaves:
@@ -47,10 +48,10 @@ class InWaves:
         self._rule = rule
         self._waves = Waves.of(store.pipeline, sampling, store.blocks)
         self._read = sorted({"detection", *sampling.variables})
-        self._known: dict[int, _Known] = {}
+        self._known: dict[int, Known] = {}
         self._settled_shares = np.zeros(len(self._waves.groups))
-        #: Numbers of the blocks that are committed on the basis that they have now.
-        self.current: set[int] = set()
+        #: The blocks, by their numbers, that are committed on the basis that they have now.
+        self.current: dict[int, Known] = {}
         #: Conditions of the grid.
         self.conditions = condition_count(store.pipeline)
         for number, receipt in receipts(store, committed(store)):
@@ -72,8 +73,9 @@ class InWaves:
     def committed(self, number: int, receipt: Receipt) -> None:
         """Note a committed block."""
         content = json.dumps([number, *(receipt.checksums.get(name, 0) for name in self._read)])
-        self._known[number] = _Known(
-            receipt.basis, zlib.crc32(content.encode()), receipt.scenes_needed, receipt.scenes)
+        self._known[number] = Known(
+            receipt.basis, zlib.crc32(content.encode()), receipt.scenes_needed, receipt.scenes,
+            receipt.detection.get("detected", 0))
 
     def _next_wave(self) -> list[Work]:
         return [*itertools.chain(*map(self._of_group, range(len(self._waves.groups))))]

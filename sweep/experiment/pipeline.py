@@ -453,8 +453,7 @@ RESERVED = {
     *VARIABLES, *LABELS, *HEADER, *parameters.SECTIONS, "axes", TRIAL,
     *(flag.name for flags in (BoundStatus, DetectionStatus, EstimateStatus, Flipped)
       for flag in flags),
-    "block", "commits", "compared", "cost", "count", "draws", "failure", "failures", "image_x_px",
-    "image_y_px",
+    "block", "commits", "compared", "cost", "count", "draws", "image_x_px", "image_y_px",
     "jitter_u_px", "jitter_v_px", "level", "looked_for", "outcome", "share", "treatment",
 }
 

@@ -61,16 +61,18 @@ BLOCK_TASK = "sweep.execution.block_task"
 
 
 class ChildError(Exception):
-    """A call in a child process has no result.
+    """A call in a child process has no result: by its message, it raised, or see below.
 
     Attributes
     ----------
     from_outside
         Whether no scene's data can have ended the process: a signal of the system did, or the
         call had not begun.
+    timed_out
+        Whether it ended because its time limit ran out.
     """
 
-    from_outside = False
+    from_outside = timed_out = False
 
     @property
     def line(self) -> str:
@@ -95,10 +97,6 @@ class ChildDiedError(ChildError):
         memory = f", as where memory runs out: {ADVICE}" if how == "SIGKILL" else ""
         super().__init__(f"its process ended: {how}{memory}")
         self.from_outside, self.timed_out = not begun or how in OUTSIDE_SIGNALS, timed_out
-
-
-class ChildRaisedError(ChildError):
-    """A call raised in the child process; the message is the traceback."""
 
 
 Result = TypeVar("Result")
@@ -161,9 +159,9 @@ class Child:
         ------
         ChildDiedError
             If the child crashed, or the call took longer than ``limit_s`` seconds.
-        ChildRaisedError
-            If the call raised; a `SweepError` is raised as it is, and a fault of the machine as
-            `MachineFaultError`.
+        ChildError
+            If the call raised, with the traceback; a `SweepError` is raised as it is, and a fault
+            of the machine as `MachineFaultError`.
         """
         if self._connection.closed:
             self._start()
@@ -188,7 +186,7 @@ class Child:
             last.join()
         raised, result = answer
         if raised:
-            raise result if isinstance(result, SweepError) else ChildRaisedError(result)
+            raise result if isinstance(result, SweepError) else ChildError(result)
         return cast("Result", result)
 
     def close(self) -> None:

@@ -182,7 +182,7 @@ def _photographs(
 # the arrays and coordinates from the creation on, tables once a store is finished.
 
 #: Groups that a finished store has.
-TABLES = ("cost", "failures")
+TABLES = ("cost",)
 
 CHANGED = "changed: does not fit its checksum"
 

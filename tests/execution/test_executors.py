@@ -85,7 +85,7 @@ def test_local_cluster_computes_the_same_bits_and_leaves_nothing(
 
 def test_processes_that_cannot_be_started_are_told_in_a_line(monkeypatch, capsys):
     monkeypatch.setattr(executors, "Child", mock.Mock(side_effect=OSError(11, "no more")))
-    with Children(Here(), 3, at_once=True) as executor:
+    with Children(Here(), 3) as executor:
         assert executor.room() == 1
     told = "1 of 3 processes could be started: BlockingIOError: [Errno 11] no more\n"
     assert capsys.readouterr().err == told
@@ -97,7 +97,7 @@ def suicide(*_):
 
 def compute_in(folder, child):
     store = create_store(str(folder / "one.zarr"), PIPELINE, (2, 6))
-    with child, Interrupts() as interrupts, Children(child, 1, at_once=True) as executor:
+    with child, Interrupts() as interrupts, Children(child, 1) as executor:
         compute(store, executor, (), 60, interrupts)
 
 

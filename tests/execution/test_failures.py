@@ -8,7 +8,6 @@ from collections import Counter
 
 import numpy as np
 import pytest
-import xarray as xr
 import zarr.storage._local as local
 from distributed import Client
 
@@ -179,9 +178,6 @@ def test_retry_computes_what_failed_and_nothing_else(pipeline, clean, copied, ca
     assert (summary.failures, summary.warnings) == ([], [])
     assert same(copied, clean)
     assert verify(copied, 0).damage == []
-    with xr.open_zarr(copied, group="failures") as table:
-        assert table.sizes["failure"] == 0
-        assert (table.attrs["failed_cells"], table.attrs["crashed_cells"]) == (0, 0)
     assert main(["run", copied, "--retry-failed"]) == 0
     assert "no cell failed or crashed; nothing is tried again" in capsys.readouterr().out
     assert same(copied, clean)

@@ -64,8 +64,6 @@ KINDS = {
     "metadata of the costs": ("cost/zarr.json", None),
     "metadata of a cost": ("cost/estimation_s/zarr.json", None),
     "chunk of a cost": ("cost/scene_s/c/0", None),
-    "metadata of the failures": ("failures/zarr.json", None),
-    "chunk of the failures": ("failures/text/c/0", None),
 }
 """Kind of file -> the key of one, and its block."""
 

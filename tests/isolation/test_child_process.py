@@ -11,7 +11,7 @@ import pytest
 
 from sweep.errors import PipelineError, StoreError
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
+from sweep.isolation.child_process import Child, ChildDiedError, ChildError
 
 pytestmark = pytest.mark.system
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.system
 def test_child_calls_functions_and_tells_what_they_raise():
     with Child() as child:
         assert child.call(pow, 2, 10, limit_s=60) == 1024
-        with pytest.raises(ChildRaisedError, match="ZeroDivisionError"):
+        with pytest.raises(ChildError, match="ZeroDivisionError"):
             child.call(divmod, 1, 0, limit_s=60)
         with pytest.raises(PipelineError) as told:
             child.call(Pipeline.from_text, "[pose]\nroll = 1", limit_s=60)

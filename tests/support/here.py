@@ -35,8 +35,6 @@ def calls_here():
     own = {name: getattr(Here, name) for name in ("__init__", "call", "close")}
     with (
         mock.patch.multiple(Child, **own),
-        mock.patch("sweep.execution.runner.SMALL_RUN_S", 300.0),
         mock.patch("sweep.execution.forecast.SMALL_RUN_S", 300.0),
-        mock.patch("sweep.execution.executors.SMALL_RUN_LIMIT_S", 300.0),
     ):
         yield

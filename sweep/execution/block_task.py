@@ -122,7 +122,6 @@ def read_cells(
             store.pipeline.experiment.scene_axes, old.extents, old.counts, strict=True
         ):
             numbers = numbers * count + at[axis.name] // extent
-        present = {variable.name for variable in store.variables}
         taken = set[int]()
         for number in done & {*np.unique(numbers[wanted]).tolist()}:
             inside = wanted & (numbers == number)
@@ -140,12 +139,10 @@ def read_cells(
                       Stage.estimation: setting * shape[2] + estimator}
             where = {name: index[ended] for name, index in where.items()}
             for v in experiment.variables:
-                if v.name in present:
-                    cells.columns[v.name][column[v.stage], scene] = v.fitted(
-                        _read(store, v.name, number, where))
-                else:  # it follows from the parameters alone
-                    values = drawn[v.drawn_as].broadcast(len(block))
-                    cells.columns[v.name][0, scene] = values[scene]
+                # Draws follow from the parameters alone; the old store may have had them fixed.
+                values = drawn[v.drawn_as].broadcast(len(block))[scene] if v.drawn_as else (
+                    v.fitted(_read(store, v.name, number, where)))
+                cells.columns[v.name][column[v.stage], scene] = values
             available |= inside
             taken.add(number)
         for _, receipt in blocks.receipts(store, taken):
@@ -266,11 +263,7 @@ def compute_block(
             try:
                 start = time.perf_counter()
                 values, receipt = _computed(
-                    store, block, needed, sources, time_limit_s, isolated=begun_before)
-                if before is not None:
-                    receipt = dataclasses.replace(receipt, seconds={
-                        stage: np.add(before.seconds[stage], spent).tolist()
-                        for stage, spent in receipt.seconds.items()})
+                    store, block, needed, sources, time_limit_s, before, isolated=begun_before)
                 receipt = blocks.write_block(store, block, values, dataclasses.replace(
                     receipt, wall_s=time.perf_counter() - start, written=time.time(), basis=basis))
             except Exception:
@@ -286,14 +279,17 @@ def compute_block(
 
 def _computed(
     store: RunStore, block: Block, needed: Masks, sources: Sequence[Source],
-    time_limit_s: float, *, isolated: bool,
+    time_limit_s: float, before: Receipt | None, *, isolated: bool,
 ) -> tuple[dict[str, NDArray[Any]], Receipt]:
     """Return the values of a block's ``needed`` scenes (N,), and what a receipt tells of them.
 
-    Cells that a source has are taken from it, the others are computed.
+    Cells that a source has are taken from it, the others are computed; seconds count from those
+    of the receipt ``before``.
     """
     pipeline, experiment = store.pipeline, store.pipeline.experiment
     cells = CellsResult.not_run(experiment, len(block))
+    if before is not None:
+        cells.seconds = {stage: [*spent] for stage, spent in before.seconds.items()}
     available, processors = read_cells(
         pipeline, block, sources if needed.any() else (), cells)
     need = needed[:, None, None] & ~available

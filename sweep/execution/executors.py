@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from queue import Empty, SimpleQueue
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 from sweep.errors import StoreReplacedError
 from sweep.evaluation.machine_faults import machine_fault
@@ -25,7 +26,7 @@ from sweep.store.blocks import Receipt
 #: How often a block is tried whose worker dies, or fails by a fault of its machine.
 MAX_ATTEMPTS = 10
 
-#: How long no block may be finished before a line says so.
+#: How long no block may be finished before a line says so, again and again.
 SILENCE_S = 60.0
 
 
@@ -109,7 +110,7 @@ class Executor(ABC):
         left, finished = iter(tasks), SimpleQueue[Any]()
         # Submitted blocks, and how they failed before.
         out: dict[Any, tuple[Task, list[Failed]]] = {}
-        last, told_s = time.monotonic(), SILENCE_S
+        last = time.monotonic()
 
         def begin(task: Task, failures: list[Failed]) -> None:
             future = self.submit(task[1], failures)
@@ -126,13 +127,12 @@ class Executor(ABC):
                 try:
                     future = finished.get(timeout=POLL_S)
                 except Empty:
-                    silent_s = time.monotonic() - last
-                    if silent_s >= told_s:
-                        told_s *= 2
-                        notice(f"no block was finished for {silent_s:.0f} s: {len(out)} are with "
+                    if time.monotonic() >= last + SILENCE_S:
+                        last = time.monotonic()
+                        notice(f"no block was finished for {SILENCE_S:.0f} s: {len(out)} are with "
                                f"{self.workers()}; a block ends after at most {limit_s:.0f} s")
                     continue
-                last, told_s = time.monotonic(), SILENCE_S
+                last = time.monotonic()
                 task, failures = out.pop(future)
                 result = self.result(future)
                 if isinstance(result, Failed):
@@ -173,7 +173,7 @@ class Executor(ABC):
 # --------------------------------------------------------------------------------------------------
 # Child processes of this machine, each called by a thread.
 
-class Children(Executor):
+class Children(Executor, contextlib.AbstractContextManager["Children"]):
     """Computes blocks in child processes.
 
     With a line, fewer do than were asked for if the system allows no more.
@@ -198,9 +198,6 @@ class Children(Executor):
             self._idle.put(each)
         self.threads = len(self._children)
         self._pool = ThreadPoolExecutor(self.threads)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         """End the processes; a thread that waits for one gets its end for an answer."""

@@ -32,8 +32,9 @@ from sweep.store.locations import is_remote
 #: Seconds of the batch of scenes that is timed before blocks are cut.
 TIMING_S = 0.2
 
-#: Seconds after which it is abandoned: it is known by then that blocks are small.
-TIMING_LIMIT_S = 5.0
+#: Seconds after which it is abandoned: a block is a scene or two then, and `sweep plan` is
+#: answered within 5 s.
+TIMING_LIMIT_S = 1.5
 
 #: Most scenes of a batch.
 MAX_BATCH = 1536
@@ -107,17 +108,17 @@ def timed(pipeline: Pipeline) -> Timing:
         count = min(wanted, GROWTH * count)
 
 
-def measure(child: Child, pipeline: Pipeline, limit_s: float = TIMING_LIMIT_S) -> Timing:
-    """Time a batch of scenes in a child process, which ends if that takes longer than ``limit_s``.
+def measure(child: Child, pipeline: Pipeline) -> Timing:
+    """Time a batch of scenes in a child process, which ends if that takes too long.
 
     If a scene crashes or raises, or this machine is at fault, a cost is assumed: whether machines
     are is seen by their blocks.
     """
     try:
-        return child.call(timed, pipeline, limit_s=limit_s, grace_s=COMPILATION_LIMIT_S)
+        return child.call(timed, pipeline, limit_s=TIMING_LIMIT_S, grace_s=COMPILATION_LIMIT_S)
     except (ChildError, MachineFaultError) as error:
         over = isinstance(error, ChildError) and error.timed_out
-        return Timing(limit_s, 1, over=True) if over else Timing(UNMEASURED_S, 0)
+        return Timing(TIMING_LIMIT_S, 1, over=True) if over else Timing(UNMEASURED_S, 0)
 
 
 #: Work up to which a run needs one process: another takes a second to import its packages.
@@ -249,9 +250,6 @@ def least_share(rule: Stopping | None) -> float:
 # --------------------------------------------------------------------------------------------------
 # The forecast of a run: blocks, bytes, memory and time, and why it has to be confirmed.
 
-#: Seconds after which a forecast, which is answered within 5 s, abandons the batch of scenes.
-PLAN_S = 1.5
-
 #: Seconds of a run apart from its blocks: processes start and end, packages are imported.
 START_S = 1.5
 
@@ -279,7 +277,7 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
     """
     check_positive("workers", workers, "expected at least 1", whole=True)
     with Child() as child:
-        timing = measure(child, pipeline, PLAN_S)
+        timing = measure(child, pipeline)
     count = process_count(pipeline, timing, workers)
     blocks = blocks_of(pipeline, timing.pose_s, count)
     expected = forecast_of(

@@ -94,7 +94,7 @@ def lost_counts(counted: Totals | Receipt) -> dict[str, int]:
 
 
 # --------------------------------------------------------------------------------------------------
-# The outcome of a run in words: what failed and why, and whether anything was computed.
+# What failed and why.
 
 #: Share of the cells that were tried, above which failures are told first.
 LOUD_SHARE = 0.1
@@ -131,58 +131,6 @@ def failure_groups(cells: Iterable[FailedCell]) -> list[dict[str, Any]]:
             "count": 0, "at": cell.at})
         group["count"] += 1
     return sorted(groups.values(), key=lambda group: -int(group["count"]))
-
-
-def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
-    """Return the outcome of the cells that a store holds, as :func:`account_of` has it.
-
-    Parameters
-    ----------
-    url
-        The store, for the command that repeats failures.
-    totals
-        Totals of its receipts.
-    first
-        A cell to look at where nothing was detected, as ``--at`` takes it.
-    """
-    groups, nothing, advice = failure_groups(
-        totals.lost["failed"] + totals.lost["crashed"]), "", ""
-    shares, warnings = [0.0], list[str]()
-    stages: tuple[tuple[type[Flag], Counter[str], str, str], ...] = (
-        (DetectionStatus, totals.detection, "detections", "nothing was detected"),
-        (EstimateStatus, totals.estimate, "estimates", "no pose was estimated"))
-    for flags, counts, cells, none_present in stages:
-        lost = {kind: counts[kind] for kind in ("failed", "crashed") if counts[kind]}
-        tried = sum(count for name, count in counts.items()
-                    if flags[name].counted and name != "no_detection")
-        share = sum(lost.values()) / max(tried, 1)
-        shares.append(share)
-        if share == 1.0:
-            warnings.append(f"nothing computed: all {tried:,} {cells} {' or '.join(lost)}")
-        elif lost:
-            listed = " and ".join(f"{count:,} {kind}" for kind, count in lost.items())
-            warnings.append(f"{'warning: ' if share > LOUD_SHARE else ''}{listed} of "
-                            f"{tried:,} {cells} ({100 * share:.4g} %)")
-        needed = Counter({name: count for name, count in counts.items() if name != "not_needed"})
-        if needed and not nothing and not any(flags[name].present for name in needed):
-            ((name, count),) = needed.most_common(1)
-            nothing = (f"warning: {none_present}: {count:,} {name} "
-                       f"({flags[name].meaning.rstrip('.')})")
-    shown, others = groups[:MAX_GROUPS], groups[MAX_GROUPS:]
-    warnings += [f"  {group['count']:,} x {group['kind']} in {group['stage']}: {group['reason']}"
-                 for group in shown]
-    if others:
-        rest = sum(group["count"] for group in others)
-        warnings.append(f"  {rest:,} x for {len(others):,} other reasons")
-    nothing = "" if 1.0 in shares else nothing
-    if groups or nothing:
-        places = [group["at"] for group in shown] if groups else [first]
-        words = [word for at in places if at for word in ("--at", at)]
-        advice = quoted("sweep", "repro", url, *words, *([] if groups else ["-o", "scene.png"]))
-    warnings += [*([nothing] if nothing else []),
-                 *differing_processors(totals.processors, "blocks")]
-    return {"nothing_computed": 1.0 in shares, "failed_share": round(max(shares), 6),
-            "failures": groups, "warnings": warnings, "advice": advice}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -266,15 +214,50 @@ def account_of(store: RunStore, totals: Totals) -> dict[str, Any]:
     cell of each reason; empty where there is nothing to tell.
     """
     pipeline, in_waves = store.pipeline, store.pipeline.stopping is not None
-    first = selection_text(pipeline, {axis.name: 0 for axis in pipeline.axes})
-    outcome = outcome_of(store.url, totals, first)
-    outcome["warnings"] += bound_notes(pipeline)
+    groups, advice = failure_groups(totals.lost["failed"] + totals.lost["crashed"]), ""
+    shares, warnings, nothing = [0.0], list[str](), list[str]()
+    stages: tuple[tuple[type[Flag], Counter[str], str, str], ...] = (
+        (DetectionStatus, totals.detection, "detections", "nothing was detected"),
+        (EstimateStatus, totals.estimate, "estimates", "no pose was estimated"))
+    for flags, counts, cells, none_present in stages:
+        lost = {kind: counts[kind] for kind in ("failed", "crashed") if counts[kind]}
+        tried = sum(count for name, count in counts.items()
+                    if flags[name].counted and name != "no_detection")
+        share = sum(lost.values()) / max(tried, 1)
+        shares.append(share)
+        if share == 1.0:
+            warnings.append(f"nothing computed: all {tried:,} {cells} {' or '.join(lost)}")
+        elif lost:
+            listed = " and ".join(f"{count:,} {kind}" for kind, count in lost.items())
+            warnings.append(f"{'warning: ' if share > LOUD_SHARE else ''}{listed} of "
+                            f"{tried:,} {cells} ({100 * share:.4g} %)")
+        needed = Counter({name: count for name, count in counts.items() if name != "not_needed"})
+        if needed and not (nothing or 1.0 in shares or any(flags[name].present for name in needed)):
+            ((name, count),) = needed.most_common(1)
+            meaning = flags[name].meaning.rstrip(".")
+            nothing = [f"warning: {none_present}: {count:,} {name} ({meaning})"]
+    shown, others = groups[:MAX_GROUPS], groups[MAX_GROUPS:]
+    warnings += [f"  {group['count']:,} x {group['kind']} in {group['stage']}: {group['reason']}"
+                 for group in shown]
+    if others:
+        rest = sum(group["count"] for group in others)
+        warnings.append(f"  {rest:,} x for {len(others):,} other reasons")
+    if groups or nothing:
+        places = [group["at"] for group in shown] or [
+            selection_text(pipeline, {axis.name: 0 for axis in pipeline.axes})]
+        words = [word for at in places if at for word in ("--at", at)]
+        advice = quoted(
+            "sweep", "repro", store.url, *words, *([] if groups else ["-o", "scene.png"]))
+    warnings += [*nothing, *differing_processors(totals.processors, "blocks"),
+                 *bound_notes(pipeline)]
     return {
         "store": store.url, "poses": pipeline.size(Stage.scene), "blocks": len(store.blocks),
         "looked_for": sum(count for name, count in totals.detection.items()
                           if DetectionStatus[name].counted),
         "needed": totals.needed if in_waves else None,
-        "conditions": condition_count(pipeline) if in_waves else None, **outcome,
+        "conditions": condition_count(pipeline) if in_waves else None,
+        "nothing_computed": 1.0 in shares, "failed_share": round(max(shares), 6),
+        "failures": groups, "warnings": warnings, "advice": advice,
     }
 
 

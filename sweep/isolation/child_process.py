@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from typing import Any, Self, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from sweep.errors import SweepError
 from sweep.evaluation.machine_faults import machine_fault
@@ -25,12 +25,8 @@ from sweep.evaluation.machine_faults import machine_fault
 # Child processes: how many, on one thread each, and how they ended.
 
 #: Variables of a child process. Parallelism is over blocks: a process computes on one thread.
-SINGLE_THREADED = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENCV_FOR_THREADS_NUM": "1",
-}
+SINGLE_THREADED = dict.fromkeys((
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
 
 #: Signals that the system or its users send, too little memory or space among their reasons: what a
 #: scene's data may cause is SIGSEGV, SIGABRT, SIGFPE, SIGILL, an exit status.
@@ -102,7 +98,7 @@ class ChildDiedError(ChildError):
 Result = TypeVar("Result")
 
 
-class Child:
+class Child(contextlib.AbstractContextManager["Child"]):
     """A child process that calls functions, one at a time; another one after it ended.
 
     Parameters
@@ -133,9 +129,6 @@ class Child:
                 pass_fds=[theirs.fileno()], env={**os.environ, **SINGLE_THREADED},
                 start_new_session=True,  # a terminal's Ctrl-C is the caller's to act on
             )
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -245,8 +238,8 @@ def _end_after(parent: int) -> None:
 POLL_S = 0.2
 
 
-class Interrupts:
-    """While this context is entered, Ctrl-C is noted, and raised by :meth:`check`.
+class Interrupts(contextlib.AbstractContextManager["Interrupts"]):
+    """Until this context is left, Ctrl-C is noted, and raised by :meth:`check`.
 
     KeyboardInterrupt inside a client's code can leave one of its locks taken, and the process then
     hangs while it closes the cluster. The second Ctrl-C is raised at once.
@@ -258,12 +251,9 @@ class Interrupts:
     def __init__(self) -> None:
         self._noted = False
         self._before: Any = None
-
-    def __enter__(self) -> Self:
         main = threading.current_thread() is threading.main_thread()
         if main and signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN):
             self._before = signal.signal(signal.SIGINT, self._note)
-        return self
 
     def __exit__(self, *_: object) -> None:
         if self._before is not None:

@@ -19,6 +19,7 @@ from sweep.execution.forecast import (
     BLOCK_S,
     BLOCKS_PER_S,
     MAX_BLOCKS,
+    TIMING_LIMIT_S,
     UNMEASURED_S,
     Timing,
     block_time_limit_s,
@@ -35,7 +36,7 @@ PIPELINE = Pipeline.from_text("[pose]\nside_px = 20\njitter_px = 0.5\n[axes]\ntr
 
 
 @pytest.mark.parametrize(("error", "timing"), [
-    (ChildDiedError("time limit", timed_out=True), Timing(5.0, 1, over=True)),
+    (ChildDiedError("time limit", timed_out=True), Timing(TIMING_LIMIT_S, 1, over=True)),
     (ChildDiedError("SIGSEGV"), Timing(UNMEASURED_S, 0)),
 ])
 def test_scenes_that_take_too_long_or_crash_are_taken_for_slow_ones(error, timing):

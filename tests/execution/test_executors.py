@@ -212,7 +212,7 @@ def test_run_without_progress_says_so_once_in_a_while(monkeypatch, capsys):
     with Interrupts() as interrupts, pytest.raises(pytest.fail.Exception):
         list(engine.map([(0, ())], 7, interrupts))
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2  # after 0.1 s, and after 0.2 s
+    assert 2 <= len(lines) <= 3  # at most each 0.1 s
     assert all("no block was finished for 0 s: 1 are with 2 workers, 1 of them paused by Dask"
                in each for each in lines)
 

@@ -5,6 +5,7 @@ import itertools
 import os
 import shutil
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,9 +25,9 @@ from sweep.execution.on_cluster import OnCluster
 from sweep.execution.runner import compute, execute
 from sweep.execution.status import (
     Totals,
+    account_of,
     close,
     failure_groups,
-    outcome_of,
     poses_per_second,
     status,
 )
@@ -47,7 +48,8 @@ TRACEBACK = """Traceback (most recent call last):
 def outcome(detection, estimate, cells):
     totals = Totals(detection=Counter(detection), estimate=Counter(estimate),
                     lost={"failed": cells, "crashed": []})
-    return outcome_of("a b.zarr", totals, "trial=0")
+    pipeline = Pipeline.from_text("[pose]\njitter_px = 1\n[axes]\ntrial = 2")
+    return account_of(SimpleNamespace(url="a b.zarr", pipeline=pipeline, blocks=[]), totals)
 
 
 def lost_cell(message, at, kind="failed", stage="estimation"):

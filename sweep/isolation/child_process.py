@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Self, TypeVar, cast
 
 from sweep.errors import SweepError
 from sweep.evaluation.machine_faults import machine_fault
@@ -238,8 +238,8 @@ def _end_after(parent: int) -> None:
 POLL_S = 0.2
 
 
-class Interrupts(contextlib.AbstractContextManager["Interrupts"]):
-    """Until this context is left, Ctrl-C is noted, and raised by :meth:`check`.
+class Interrupts:
+    """While this context is entered, Ctrl-C is noted, and raised by :meth:`check`.
 
     KeyboardInterrupt inside a client's code can leave one of its locks taken, and the process then
     hangs while it closes the cluster. The second Ctrl-C is raised at once.
@@ -251,9 +251,12 @@ class Interrupts(contextlib.AbstractContextManager["Interrupts"]):
     def __init__(self) -> None:
         self._noted = False
         self._before: Any = None
+
+    def __enter__(self) -> Self:
         main = threading.current_thread() is threading.main_thread()
         if main and signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN):
             self._before = signal.signal(signal.SIGINT, self._note)
+        return self
 
     def __exit__(self, *_: object) -> None:
         if self._before is not None:

@@ -48,7 +48,7 @@ TRACEBACK = """Traceback (most recent call last):
 def outcome(detection, estimate, cells):
     totals = Totals(detection=Counter(detection), estimate=Counter(estimate),
                     lost={"failed": cells, "crashed": []})
-    pipeline = Pipeline.from_text("[pose]\njitter_px = 1\n[axes]\ntrial = 2")
+    pipeline = Pipeline.from_text("[pose]\njitter_px = 1\nside_px = 9\n[axes]\ntrial = 2")
     return account_of(SimpleNamespace(url="a b.zarr", pipeline=pipeline, blocks=[]), totals)
 
 

@@ -16,6 +16,7 @@ A scene is rendered once for all detector settings, and a detection is shared by
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -33,6 +34,7 @@ from sweep.experiment.experiment import Experiment
 from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
+from sweep.measure.detectors import PluginSetting, make_detector
 from sweep.measure.estimation import Detections, Estimates, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus
@@ -282,6 +284,34 @@ def bound_notes(pipeline: Pipeline) -> list[str]:
     sampled = "" if len(numbers) == total else f" ({len(numbers)} of {total:,} were looked at)"
     reasons = "; ".join(f"{flag.name}: {NO_BOUND[flag]}" for flag in sorted(found))
     return [f"warning: no pose has a bound{sampled}: {reasons}"]
+
+
+# --------------------------------------------------------------------------------------------------
+# Before a run: plug-ins are used once; one that cannot work refuses the run, and costs no pose.
+
+#: Settings that are tried, of all plug-ins.
+MAX_SETTINGS = 64
+
+
+@single_threaded()
+def try_plugins(pipeline: Pipeline) -> None:
+    """Import plug-ins and make them with each of their settings; detectors search a blank frame.
+
+    Raises
+    ------
+    PluginError
+        If that cannot be done.
+    """
+    experiment = pipeline.experiment
+    _ = experiment.scene_plugins
+    width, height = (min(pipeline.values_of(side)) for side in ("width_px", "height_px"))
+    blank = np.full((height, width), 128, dtype=np.uint8)
+    searches = itertools.product(pipeline.values_of("dictionary"), (
+        each for each in dict.fromkeys(experiment.detectors) if isinstance(each, PluginSetting)))
+    for dictionary, setting in itertools.islice(searches, MAX_SETTINGS):
+        make_detector(setting)(blank, dictionary, max(width, height))
+    for solver in itertools.islice(dict.fromkeys(experiment.estimators), MAX_SETTINGS):
+        build(solver)
 
 
 # --------------------------------------------------------------------------------------------------

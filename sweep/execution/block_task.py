@@ -283,8 +283,8 @@ def _computed(
 ) -> tuple[dict[str, NDArray[Any]], Receipt]:
     """Return the values of a block's ``needed`` scenes (N,), and what a receipt tells of them.
 
-    Cells that a source has are taken from it, the others are computed; seconds count from those
-    of the receipt ``before``.
+    Cells that a source has are taken from it, the others are computed: in this process, or in a
+    child if that was tried or the block raises. Seconds count from those of the receipt ``before``.
     """
     pipeline, experiment = store.pipeline, store.pipeline.experiment
     cells = CellsResult.not_run(experiment, len(block))
@@ -296,9 +296,20 @@ def _computed(
     # Scenes of which every cell is reused are not rendered.
     rows = np.flatnonzero(need.any(axis=(1, 2)))
     if len(rows):
-        cells.take(experiment, _compute(
-            pipeline, block.indices(rows), need[rows], time_limit_s, isolated=isolated),
-            rows, need[rows])
+        indices, some = block.indices(rows), need[rows]
+        if not isolated:
+            try:
+                with ending_after(WHOLE * time_limit_s):
+                    part = run_cells(experiment, indices, some)
+            except MachineFaultError:
+                raise
+            except Exception:
+                isolated = True  # it raises as a whole, as single scenes may
+        if isolated:
+            part = run_cells_isolated(pipeline, indices, some, time_limit_s)
+        # What raises is a result only if it raises again in another process.
+        check_repeatable(pipeline, indices, some, part, time_limit_s)
+        cells.take(experiment, part, rows, some)
         processors.add(processor())
     for v in experiment.variables:
         cells.columns[v.name][:, ~needed] = v.not_needed
@@ -315,25 +326,3 @@ def _computed(
         seconds=cells.seconds,
         failures=blocks.recorded(pipeline, block, cells.failures),
     )
-
-
-def _compute(
-    pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: Masks,
-    time_limit_s: float, *, isolated: bool,
-) -> CellsResult:
-    """Compute cells in this process, or in a child if that was tried or the block raises.
-
-    What raises is a result only if it raises again in another process.
-    """
-    if not isolated:
-        try:
-            with ending_after(WHOLE * time_limit_s):
-                cells = run_cells(pipeline.experiment, indices, need)
-        except MachineFaultError:
-            raise
-        except Exception:
-            isolated = True  # it raises as a whole, as single scenes may
-    if isolated:
-        cells = run_cells_isolated(pipeline, indices, need, time_limit_s)
-    check_repeatable(pipeline, indices, need, cells, time_limit_s)
-    return cells

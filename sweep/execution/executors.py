@@ -145,9 +145,9 @@ class Executor(ABC):
         finally:
             self.cancel(out)
 
-    @abstractmethod
     def room(self) -> int:
         """Return how many blocks may be out now."""
+        return self.threads
 
     @abstractmethod
     def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
@@ -161,9 +161,9 @@ class Executor(ABC):
         """Return whether a block that machines failed may be tried again: here once."""
         return len(failures) == 1
 
-    @abstractmethod
     def workers(self) -> str:
         """Return in words what computes."""
+        return f"{self.threads} processes"
 
     @abstractmethod
     def cancel(self, out: Collection[Any]) -> None:
@@ -206,14 +206,6 @@ class Children(Executor, contextlib.AbstractContextManager["Children"]):
         self._pool.shutdown(cancel_futures=True)
         for child in self._children:  # one may have been begun again meanwhile
             child.close()
-
-    def room(self) -> int:
-        """Return the number of processes."""
-        return self.threads
-
-    def workers(self) -> str:
-        """Return how many processes there are."""
-        return f"{self.threads} processes"
 
     def submit(self, arguments: tuple[Any, ...], _failures: list[Failed]) -> Any:
         """Have a thread call a child that is idle."""

@@ -32,9 +32,8 @@ from sweep.store.locations import is_remote
 #: Seconds of the batch of scenes that is timed before blocks are cut.
 TIMING_S = 0.2
 
-#: Seconds after which it is abandoned: a block is a scene or two then, and `sweep plan` is
-#: answered within 5 s.
-TIMING_LIMIT_S = 1.5
+#: Seconds after which it is abandoned: it is known by then that blocks are small.
+TIMING_LIMIT_S = 5.0
 
 #: Most scenes of a batch.
 MAX_BATCH = 1536

@@ -302,8 +302,7 @@ class OnCluster(Executor):
                 return Failed(exception_line(error))
         finally:
             future.release()
-        if self._client.status != "running":
-            raise RunError(AWAY)
+        self._look()  # it raises if the scheduler went away
         # A block that ends its process is computed in isolation when it is begun again, but it may
         # have been queued behind one, or its workers were killed from outside; or died with its
         # receipt.

@@ -44,15 +44,15 @@ class Progress:
     conditions: int | None = None
 
     @property
-    def shown(self) -> tuple[str, float, float]:
-        """Progress in words, how much is done, and of how much.
+    def shown(self) -> tuple[str, float]:
+        """Progress in words, and the share that is done.
 
         How many poses a run in waves will need is not known.
         """
         if self.conditions is None:
-            return f"{self.done:,} of {self.total:,} poses", self.done, self.total
+            return f"{self.done:,} of {self.total:,} poses", self.done / self.total
         line = f"{self.settled:,} of {self.conditions:,} conditions done, {self.needed:,} poses"
-        return line, self.settled or 0, self.conditions
+        return line, (self.settled or 0) / self.conditions
 
 
 ProgressReport = Callable[[Progress], None]
@@ -94,16 +94,14 @@ def progress_display(*, ends: bool = False) -> Iterator[ProgressReport]:
         yield lambda progress: show(*progress.shown)
 
 
-@contextlib.contextmanager
-def stage_display() -> Iterator[StageReport]:
+def stage_display() -> contextlib.AbstractContextManager[StageReport]:
     """Show the current step on stderr: a bar on a terminal, else a line for each new step."""
-    with _display(0.0, ends=True) as show:
-        yield lambda what, share: show(what, share, 1.0)
+    return _display(0.0, ends=True)
 
 
 @contextlib.contextmanager
-def _display(every_s: float, *, ends: bool) -> Iterator[Callable[[str, float, float], None]]:
-    """Show what is done, how much of it, and of how much, on stderr.
+def _display(every_s: float, *, ends: bool) -> Iterator[StageReport]:
+    """Show what is done, and which share of it, on stderr.
 
     On a terminal, that is a bar, which disappears at the end; elsewhere new lines ``every_s``, and
     with ``ends`` at once and at the end.
@@ -111,10 +109,10 @@ def _display(every_s: float, *, ends: bool) -> Iterator[Callable[[str, float, fl
     if sys.stderr is None or not sys.stderr.isatty():
         told, told_s = "", -math.inf if ends else time.monotonic()
 
-        def line(what: str, done: float, total: float) -> None:
+        def line(what: str, share: float) -> None:
             nonlocal told, told_s
             now = time.monotonic()
-            if what != told and (now >= told_s + every_s or (ends and done == total)):
+            if what != told and (now >= told_s + every_s or (ends and share == 1.0)):
                 notice(what)
                 told, told_s = what, now
 
@@ -127,5 +125,4 @@ def _display(every_s: float, *, ends: bool) -> Iterator[Callable[[str, float, fl
                rich.TimeRemainingColumn())
     with rich.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None)
-        yield lambda what, done, total: bar.update(
-            task, description=what, completed=done, total=total)
+        yield lambda what, share: bar.update(task, description=what, completed=share, total=1.0)

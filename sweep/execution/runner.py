@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from sweep import compilation, errors
+from sweep.evaluation.block import try_plugins
 from sweep.execution import forecast, status
 from sweep.execution.executors import Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport, progress_report
@@ -21,8 +22,7 @@ from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import NO_TRIALS, search_settings
-from sweep.isolation.child_process import Child, Interrupts
-from sweep.isolation.crash_isolation import check_plugins
+from sweep.isolation.child_process import Child, ChildError, Interrupts
 from sweep.messages import notice
 from sweep.sampling.rules import make_rule
 from sweep.store import blocks, lifecycle
@@ -41,22 +41,20 @@ if TYPE_CHECKING:
 # --------------------------------------------------------------------------------------------------
 # A run from a pipeline to a finished store: prepare, compute and finish, in order.
 
-#: Seconds that compilation takes: for all runs, for `photometric_real` beyond that, and for the
-#: bound and `photometric`.
-RENDERER_S, PHOTOGRAPH_S, LIKELIHOOD_S = 8, 20, 10
+#: Seconds that compilation takes: for all runs, for the bound and `photometric` beyond that, and
+#: for `photometric_real`.
+RENDERER_S, LIKELIHOOD_S, PHOTOGRAPH_S = 8, 10, 20
 
 
 def announce_compilation(pipeline: Pipeline) -> None:
     """Say in a line on stderr that a pipeline's functions are compiled, if they have not been."""
-    solvers = pipeline.values_of("solver")
-    fits = "photometric" in solvers or bool(set(pipeline.values_of("bound")) - {"none"})
-    seconds = sum(
-        length for needed, module, name, length in (
-            (True, "model.coverage", "accumulate", RENDERER_S),
-            (fits, "measure.likelihood", "descend", LIKELIHOOD_S),
-            ("photometric_real" in solvers, "measure.photograph", "locate_photograph",
-             PHOTOGRAPH_S))
-        if needed and not compilation.is_cached(f"sweep.{module}", name))
+    solvers, needed = pipeline.values_of("solver"), {"model.coverage.accumulate": RENDERER_S}
+    if "photometric" in solvers or set(pipeline.values_of("bound")) - {"none"}:
+        needed["measure.likelihood.descend"] = LIKELIHOOD_S
+    if "photometric_real" in solvers:
+        needed["measure.photograph.locate_photograph"] = PHOTOGRAPH_S
+    seconds = sum(length for name, length in needed.items()
+                  if not compilation.is_cached(*f"sweep.{name}".rsplit(".", 1)))
     if seconds:
         notice(f"compiling, once for this version: about {seconds} s")
 
@@ -189,6 +187,26 @@ def execute(
 
 
 # Before anything is computed
+
+#: Seconds that a plug-in may take to be made, and to search one blank frame.
+PLUGIN_LIMIT_S = 60.0
+
+
+def check_plugins(child: Child, pipeline: Pipeline) -> None:
+    """Use a pipeline's plug-ins in a child process, which goes on to work.
+
+    Raises
+    ------
+    PluginError
+        If one cannot be imported or made, raises on a blank frame, ends its process, or does not
+        return; in one line.
+    """
+    try:
+        if pipeline.plugins:
+            child.call(try_plugins, pipeline, limit_s=PLUGIN_LIMIT_S * len(pipeline.plugins))
+    except ChildError as error:
+        names = " or ".join(f"{plugin.kind} {plugin.name}" for plugin in pipeline.plugins)
+        raise errors.PluginError(f"{names}: {error.line}") from None
 
 
 def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStore | None:

@@ -213,7 +213,7 @@ def account_of(store: RunStore, totals: Totals) -> dict[str, Any]:
     pose estimated; what may surprise of the pipeline. ``advice``: the command that recomputes one
     cell of each reason; empty where there is nothing to tell.
     """
-    pipeline, in_waves = store.pipeline, store.pipeline.stopping is not None
+    pipeline, rule = store.pipeline, store.pipeline.stopping
     groups, advice = failure_groups(totals.lost["failed"] + totals.lost["crashed"]), ""
     shares, warnings, nothing = [0.0], list[str](), list[str]()
     stages: tuple[tuple[type[Flag], Counter[str], str, str], ...] = (
@@ -254,8 +254,8 @@ def account_of(store: RunStore, totals: Totals) -> dict[str, Any]:
         "store": store.url, "poses": pipeline.size(Stage.scene), "blocks": len(store.blocks),
         "looked_for": sum(count for name, count in totals.detection.items()
                           if DetectionStatus[name].counted),
-        "needed": totals.needed if in_waves else None,
-        "conditions": condition_count(pipeline) if in_waves else None,
+        "needed": None if rule is None else totals.needed,
+        "conditions": None if rule is None else condition_count(pipeline, rule),
         "nothing_computed": 1.0 in shares, "failed_share": round(max(shares), 6),
         "failures": groups, "warnings": warnings, "advice": advice,
     }

@@ -53,7 +53,7 @@ class InWaves:
         #: The blocks, by their numbers, that are committed on the basis that they have now.
         self.current: dict[int, Known] = {}
         #: Conditions of the grid.
-        self.conditions = condition_count(store.pipeline)
+        self.conditions = condition_count(store.pipeline, rule)
         for number, receipt in receipts(store, committed(store)):
             self.committed(number, receipt)
         self._next = self._next_wave()
@@ -115,10 +115,9 @@ class InWaves:
 # --------------------------------------------------------------------------------------------------
 # Conditions of a run in waves, and those that are not settled at its end.
 
-def condition_count(pipeline: Pipeline) -> int:
+def condition_count(pipeline: Pipeline, rule: StoppingRule) -> int:
     """Return the number of conditions of a run in waves."""
-    assert pipeline.stopping is not None  # noqa: S101  (a section says so)
-    return math.prod(len(pipeline.axis(name) or ()) for name in pipeline.stopping.per)
+    return math.prod(len(pipeline.axis(name) or ()) for name in rule.per)
 
 
 def unsettled_count(store: RunStore, rule: StoppingRule) -> int:

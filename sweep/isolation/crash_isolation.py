@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import math
 import time
 from collections import Counter
@@ -13,16 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.errors import PluginError
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.machine_faults import machine_faults_raised
-from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure
 from sweep.evaluation.variables import WITHOUT_DETECTION
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildDiedError, ChildError
-from sweep.measure.detectors import PluginSetting, make_detector
-from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import local_fault
 from sweep.store.blocks import selected
@@ -195,52 +190,3 @@ def check_repeatable(
             if not each.crashed and dataclasses.replace(each, text="") not in repeated:
                 raise local_fault("raised in a scene, but not when that was repeated in another "
                                   f"process: {each.text.strip().splitlines()[-1]}")
-
-
-# --------------------------------------------------------------------------------------------------
-# Plug-ins are used once before a run: one that cannot work refuses it, and costs no pose.
-
-#: Seconds that a plug-in may take to be made, and to search one blank frame.
-LIMIT_S = 60.0
-
-#: Settings that are tried, of all plug-ins.
-MAX_SETTINGS = 64
-
-
-def check_plugins(child: Child, pipeline: Pipeline) -> None:
-    """Use a pipeline's plug-ins in a child process, which goes on to work.
-
-    Raises
-    ------
-    PluginError
-        If one cannot be imported or made, raises on a blank frame, ends its process, or does not
-        return; in one line.
-    """
-    if not pipeline.plugins:
-        return
-    try:
-        child.call(use, pipeline, limit_s=LIMIT_S * len(pipeline.plugins))
-    except ChildError as error:
-        names = " or ".join(f"{plugin.kind} {plugin.name}" for plugin in pipeline.plugins)
-        raise PluginError(f"{names}: {error.line}") from None
-
-
-@single_threaded()
-def use(pipeline: Pipeline) -> None:
-    """Import plug-ins and make them with each of their settings; detectors search a blank frame.
-
-    Raises
-    ------
-    PluginError
-        If that cannot be done.
-    """
-    experiment = pipeline.experiment
-    _ = experiment.scene_plugins
-    width, height = (min(pipeline.values_of(side)) for side in ("width_px", "height_px"))
-    blank = np.full((height, width), 128, dtype=np.uint8)
-    searches = itertools.product(pipeline.values_of("dictionary"), (
-        each for each in dict.fromkeys(experiment.detectors) if isinstance(each, PluginSetting)))
-    for dictionary, setting in itertools.islice(searches, MAX_SETTINGS):
-        make_detector(setting)(blank, dictionary, max(width, height))
-    for solver in itertools.islice(dict.fromkeys(experiment.estimators), MAX_SETTINGS):
-        build(solver)

@@ -21,12 +21,12 @@ from support.stores import by_hand
 from sweep.analysis.dataset import parameter_value
 from sweep.cli import main
 from sweep.errors import PipelineError, PluginError, StoreError
+from sweep.evaluation.block import try_plugins
 from sweep.evaluation.inspection import scene_image
 from sweep.execution.block_task import match, other_here
-from sweep.execution.runner import execute
+from sweep.execution.runner import check_plugins, execute
 from sweep.experiment.parameters import lacking_plugins
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.crash_isolation import check_plugins, use
 from sweep.measure.detectors import full_frame_reason
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plugins.loading import call
@@ -311,7 +311,7 @@ def bad(tmp_path):
 ])
 def test_an_image_at_which_a_detector_is_at_fault_is_flagged(bad, returned, told):
     pipeline = bad(returned)
-    use(pipeline)  # on a blank frame nothing is wrong
+    try_plugins(pipeline)  # on a blank frame nothing is wrong
     cells = run_cells(pipeline, [])
     assert [flags.tolist() for flags in cells.columns["detection"]] == [
         [DetectionStatus.detected], [DetectionStatus.failed],

@@ -34,7 +34,8 @@ from sweep.typing import Masks
 
 WHOLE, SHARE, LEAST = 1 / 4, 1 / 6, 1 / 32
 
-#: How many fresh processes the cells of a scene must end, each alone, before one is flagged.
+#: How many fresh processes a cell must end, one after another, to be flagged; one that ends a
+#: process is enough for the other cells of its scene.
 DEATHS = 3
 
 #: Least time limit of a call.
@@ -95,7 +96,7 @@ def run_cells_isolated(
     end = time.monotonic() + (1 - WHOLE) * limit_s
     result = CellsResult.not_run(pipeline.experiment, len(need))
     lost: dict[tuple[int, int, int], Failure] = {}
-    ended = Counter[int]()  # scene -> calls without a result for one of its cells alone
+    deaths = Counter[tuple[int, int, int]]()  # of processes that computed one cell alone
 
     def run(rows: NDArray[np.intp], wanted: Masks) -> None:
         """Compute the ``wanted`` cells of scenes ``rows`` (n,); take over their results."""
@@ -118,18 +119,18 @@ def run_cells_isolated(
                 died = isinstance(error, ChildDiedError)
                 row, k, j = (int(at) for at in np.argwhere(wanted)[0])
                 failure = Failure(row, "estimation", str(error), k, j, crashed=died)
-                ended[row] += 1
+                deaths[row, k, j] += 1
                 if error.from_outside:
                     at = selected(pipeline, [int(index[row]) for index in indices], failure)
                     raise local_fault(f"{error.line}; the scene is --at {at}") from None
-                if died and ended[row] < DEATHS:
+                if died and deaths[row, k, j] < DEATHS and not any(at[0] == row for at in lost):
                     compute(piece)
                 else:
                     lost[row, k, j] = failure
 
     with Child() as child:
         compute(np.flatnonzero(need))
-        for row in ended:
+        for row in {row for row, _, _ in lost}:
             with contextlib.suppress(ChildError):  # its parameters and truth
                 run(np.array([row]), np.zeros_like(need))
     flags = result.columns

@@ -8,7 +8,6 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from typing import Any
 
 from numba.core import event
 
@@ -66,8 +65,7 @@ class _Compiling(event.Listener):
 
 
 _compiling = _Compiling()
-_register: Any = event.register
-_register("numba:compile", _compiling)
+event.register("numba:compile", _compiling)  # type: ignore[no-untyped-call]
 
 
 def _clock_s() -> float:

@@ -165,6 +165,7 @@ def run_cells(
     experiment: Experiment,
     indices: Sequence[NDArray[np.intp]],
     need: Masks | None = None,
+    searched: Masks | None = None,
 ) -> results.CellsResult:
     """Render, detect and estimate scene cells.
 
@@ -177,6 +178,9 @@ def run_cells(
     need
         (N, detector settings, estimators) the estimates that are computed; all by default. The
         others are flagged ``not_run``.
+    searched
+        (N, detector settings) the searches that are made; those for the estimates by default. By
+        it a search that ends its process is told from an estimate that does.
 
     Returns
     -------
@@ -191,6 +195,8 @@ def run_cells(
     grid, count = experiment.grid, len(indices[0]) if indices else 1
     if need is None:
         need = np.ones((count, grid.size(Stage.detection), grid.size(Stage.estimation)), dtype=bool)
+    if searched is None:
+        searched = np.asarray(need.any(axis=2))
     builds = [build(setting) for setting in experiment.estimators]
     size = max(count, 1)
     if experiment.solvers_on_pixels:
@@ -202,24 +208,27 @@ def run_cells(
         for at in range(0, max(count, 1), size):
             part = slice(at, at + size)
             _run_batch(
-                experiment, builds, [index[part] for index in indices], need[part], part, result)
+                experiment, builds, [index[part] for index in indices], need[part],
+                searched[part], part, result,
+            )
     return result
 
 
 def _run_batch(
     experiment: Experiment, builds: Sequence[PoseEstimator],
-    indices: Sequence[NDArray[np.intp]], need: Masks, part: slice, result: results.CellsResult,
+    indices: Sequence[NDArray[np.intp]], need: Masks, searched: Masks, part: slice,
+    result: results.CellsResult,
 ) -> None:
     """Write the results of scenes that are in memory together to ``part`` of a result's scenes.
 
-    ``need`` is as in :func:`run_cells`, of these scenes.
+    ``need`` and ``searched`` are as in :func:`run_cells`, of these scenes.
     """
     failures: list[results.Failure] = []
     columns = {name: column[:, part] for name, column in result.columns.items()}
     drawn = {variable.name: variable.drawn_as for variable in experiment.drawn}
 
     start = time.perf_counter()
-    batch, searched = scenes_at(experiment, indices), np.asarray(need.any(axis=2))
+    batch = scenes_at(experiment, indices)
     found = detections_of(
         batch, searched & batch.visible[:, None], failures,
         keep=bool(experiment.solvers_on_pixels),

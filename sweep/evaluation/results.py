@@ -21,8 +21,8 @@ from sweep.experiment.experiment import Experiment
 from sweep.experiment.grid import Block, Grid
 from sweep.experiment.parameters import Stage
 from sweep.experiment.schema import SCHEMA, Tolerance, Variable
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.pose import rotation_of_vector
-from sweep.typing import Masks
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,23 +135,13 @@ class CellsResult:
 
 
     def take(
-        self, experiment: Experiment, part: CellsResult, rows: NDArray[np.intp], computed: Masks
+        self, experiment: Experiment, part: CellsResult, rows: NDArray[np.intp]
     ) -> None:
-        """Take over the results of some scenes.
-
-        Parameters
-        ----------
-        experiment
-            The experiment.
-        part, rows
-            The results of n scenes, and their numbers (n,) here.
-        computed
-            (n, detector settings, estimators) the cells that were computed, each as a whole.
-        """
+        """Take over what was computed of n scenes, whose numbers here are ``rows`` (n,)."""
         where = {
             Stage.scene: np.ones((1, len(rows)), dtype=bool),
-            Stage.detection: computed.any(axis=2).T,
-            Stage.estimation: computed.reshape(len(rows), -1).T,
+            Stage.detection: part.columns["detection"] != DetectionStatus.not_run,
+            Stage.estimation: part.columns["estimate"] != EstimateStatus.not_run,
         }
         for v in experiment.variables:
             column, row = np.nonzero(where[v.stage])

@@ -163,15 +163,14 @@ def other_here(pipeline: Pipeline, begun: Mapping[str, Any]) -> list[str]:
     begun
         The fingerprint of the process that began.
     """
-    # The content of a camera file is in the pipeline's text.
-    images = pipeline.values_of("background")
     return [
         *(f"{name} is {own}, the run began with {value}" for name, value, own in changes(
             begun, fingerprint(pipeline))),
         *lacking_plugins(pipeline.plugins, pipeline.folder),
+        # The content of a camera file is in the pipeline's text.
         *(f"{path} is not in {pipeline.folder} as it was when the run began"
-          for path, digest in begun["files"].items()
-          if path in images and file_digest(Path(pipeline.folder) / path) != digest),
+          for path in sorted(begun["files"].keys() & {*pipeline.values_of("background")})
+          if file_digest(Path(pipeline.folder) / path) != begun["files"][path]),
     ]
 
 
@@ -309,7 +308,7 @@ def _computed(
             part = run_cells_isolated(pipeline, indices, some, time_limit_s)
         # What raises is a result only if it raises again in another process.
         check_repeatable(pipeline, indices, some, part, time_limit_s)
-        cells.take(experiment, part, rows, some)
+        cells.take(experiment, part, rows)
         processors.add(processor())
     for v in experiment.variables:
         cells.columns[v.name][:, ~needed] = v.not_needed

@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from sweep.errors import ArgumentError
 from sweep.messages import notice
@@ -19,8 +19,7 @@ from sweep.messages import notice
 LINE_INTERVAL_S = 30.0
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
+class Progress(NamedTuple):
     """How far a run is; passed to the caller before the first block and after each one.
 
     Attributes

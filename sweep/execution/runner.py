@@ -133,7 +133,7 @@ def execute(
         announce_compilation(pipeline)
     url = errors.path_of("store", store) if store is not None else f"runs/{pipeline.name}.zarr"
     begun = _store_to_continue(url, pipeline, overwrite)
-    again = status.failed_blocks(begun) if retry_failed and begun is not None else {}
+    again = status.failed_blocks(begun, blocks.committed(begun)) if begun and retry_failed else {}
     stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
     if begun is not None and begun.finished and not (again or stricter):
         blocks.check_whole(begun)

@@ -177,19 +177,16 @@ def close(store: RunStore) -> None:
 # --------------------------------------------------------------------------------------------------
 # Blocks that are computed again, as if they never had been: those in which cells failed, say.
 
-def failed_blocks(store: RunStore, numbers: Iterable[int] | None = None) -> dict[int, int]:
-    """Return the committed blocks in which cells failed or crashed, and how many did.
-
-    ``numbers``: the blocks that are looked at, by default all.
+def failed_blocks(store: RunStore, numbers: Iterable[int]) -> dict[int, int]:
+    """Return the blocks, of some committed ones, in which cells failed or crashed; how many did.
 
     Raises
     ------
     StoreError
         If a receipt is damaged.
     """
-    chosen = blocks.committed(store) if numbers is None else numbers
     return {
-        number: count for number, receipt in blocks.receipts(store, chosen)
+        number: count for number, receipt in blocks.receipts(store, numbers)
         if (count := sum(lost_counts(receipt).values()))
     }
 

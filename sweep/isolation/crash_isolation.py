@@ -8,6 +8,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,15 +42,12 @@ DEATHS = 3
 #: Least time limit of a call.
 MIN_S = 1.0
 
-#: How long a child may take to start and to unpickle the pipeline.
-START_S = 300.0
-
 #: Into how many pieces cells are cut that crashed a process together.
 PIECES = 64
 
 
-def _run(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: Masks) -> CellsResult:
-    return run_cells(pipeline.experiment, indices, need)
+def _run(pipeline: Pipeline, *arguments: Any) -> CellsResult:
+    return run_cells(pipeline.experiment, *arguments)
 
 
 def _pieces(cells: NDArray[np.intp], configurations: int) -> list[NDArray[np.intp]]:
@@ -71,7 +69,7 @@ def run_cells_isolated(
     """Compute cells as `sweep.evaluation.block.run_cells` does, also if they crash their process.
 
     A cell that ends each of :data:`DEATHS` child processes is flagged ``crashed``, one that raises
-    as a whole ``failed``: its detection if no other estimate of that worked, else the estimate. A
+    as a whole ``failed``: its detection if the search alone ends so, too, else the estimate. A
     signal from outside, such as the system sends to a process that uses too much memory, is the
     machine's fault. All other cells have the same values as in one call, bit for bit: what worked
     alone does not depend on what else its scene has.
@@ -98,20 +96,21 @@ def run_cells_isolated(
     lost: dict[tuple[int, int, int], Failure] = {}
     deaths = Counter[tuple[int, int, int]]()  # of processes that computed one cell alone
 
-    def run(rows: NDArray[np.intp], wanted: Masks) -> None:
-        """Compute the ``wanted`` cells of scenes ``rows`` (n,); take over their results."""
+    def run(rows: NDArray[np.intp], *masks: Masks) -> None:
+        """Call ``run_cells`` for scenes ``rows`` (n,) and masks of them; take over the results."""
         share_s = max(SHARE * (end - time.monotonic()), LEAST * limit_s, MIN_S)
-        part = child.call(_run, pipeline, [index[rows] for index in indices], wanted[rows],
-                          limit_s=share_s, grace_s=START_S)
-        result.take(pipeline.experiment, part, rows, wanted[rows])
+        part = child.call(
+            _run, pipeline, [index[rows] for index in indices], *masks, limit_s=share_s)
+        result.take(pipeline.experiment, part, rows)
 
     def compute(cells: NDArray[np.intp]) -> None:
         """Compute cells by their numbers; those that end the process in smaller pieces."""
         for piece in _pieces(cells, need[0].size):
             wanted = np.zeros_like(need)
             wanted.flat[piece] = True
+            rows = np.unique(piece // need[0].size)
             try:
-                run(np.unique(piece // need[0].size), wanted)
+                run(rows, wanted[rows])
             except ChildError as error:
                 if len(piece) > 1:
                     compute(piece)
@@ -130,9 +129,13 @@ def run_cells_isolated(
 
     with Child() as child:
         compute(np.flatnonzero(need))
-        for row in {row for row, _, _ in lost}:
-            with contextlib.suppress(ChildError):  # its parameters and truth
-                run(np.array([row]), np.zeros_like(need))
+        # Of a lost cell, its search alone; if that dies, the scene's parameters and truth alone.
+        for row, k in dict.fromkeys((row, k) for row, k, _ in lost):
+            nothing = np.zeros_like(need[:1])
+            for searched in (np.arange(need.shape[1]) == k, nothing[0, :, 0]):
+                with contextlib.suppress(ChildError):
+                    run(np.array([row]), nothing, searched[None])
+                    break
     flags = result.columns
     unseen = flags["detection"] == DetectionStatus.not_run
     for (row, k, j), failure in lost.items():

@@ -43,7 +43,7 @@ def dropping(folder, _, number):
     """Drop the blocks with failed cells of a copy of a complete store."""
     store = open_store(
         shutil.copytree(f"{folder}/complete.zarr", f"{folder}/{number}.zarr"), "r+")
-    reopen(store, drop=failed_blocks(store))
+    reopen(store, drop=failed_blocks(store, range(len(store.blocks))))
 
 
 def creating(folder, file, number):

@@ -186,7 +186,7 @@ def paired_tables(
 
     Beside it there is whether any cell has two draws, ``drawn``, and there are ``more`` statistics.
     """
-    stopped = dataset.is_sampling_stopped(first) or dataset.is_sampling_stopped(second)
+    stopped = any(dataset.stopping_rule(side) is not None for side in (first, second))
     if stopped and DRAWS in first.dims and DRAWS in second.dims:
         first, second = xr.align(
             first, second, join="inner", exclude={*first.dims, *second.dims} - {DRAWS})
@@ -718,18 +718,9 @@ def _changes(
 # --------------------------------------------------------------------------------------------------
 # Two datasets whose trials are units of markers: photographs, and a simulation's scenes.
 
-#: Shares of the photographs' markers between which the default bins lie.
-QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
-
 SIDE = "side_px"
 
 TRUTH_STD = "truth_std"
-
-#: Dimension of the trials of a twin that are of one photograph.
-REPEAT = "repeat"
-
-SEED = 21
-
 
 def is_measured(results: xr.Dataset) -> bool:
     """Return whether a dataset is measured in photographs."""
@@ -813,7 +804,7 @@ def _with_uncertain_truth(
     exact one. A draw is of a marker, the same for all its configurations.
     """
     one = std.isel({name: 0 for name in kept if name in std.dims}, drop=True)
-    drawn = one.copy(data=np.random.default_rng(SEED).normal(size=one.shape)) * std.fillna(0.0)
+    drawn = one.copy(data=np.random.default_rng(21).normal(size=one.shape)) * std.fillna(0.0)
     parts = {"rotation_error_rad": slice(3), "translation_error_m": slice(3, None)}
     return results.assign({
         name: results[name] + drawn.isel(pose_parameter=part).rename(pose_parameter="xyz")
@@ -836,7 +827,7 @@ def _binned(results: xr.Dataset, name: str) -> xr.DataArray:
 def _quarters(photographs: xr.Dataset) -> list[float]:
     """Return edges between the quarters of the photographs' sides, of two significant digits."""
     sides = photographs[SIDE].values
-    edges = np.quantile(sides[np.isfinite(sides)], QUARTERS)
+    edges = np.quantile(sides[np.isfinite(sides)], np.linspace(0.0, 1.0, 5))
     rounded = [float(f"{edge:.2g}") for edge in edges]
     rounded[0], rounded[-1] = float(np.floor(edges[0])), float(np.floor(edges[-1]) + 1)
     return sorted(set(rounded))
@@ -845,12 +836,12 @@ def _quarters(photographs: xr.Dataset) -> list[float]:
 # --------------------------------------------------------------------------------------------------
 # Photographs against a simulation: what of the errors in photographs the simulation has.
 
-SOURCES = ("photographs", "simulated")
-
 PERCENTS = {"median": 50, "p90": 90}
 
 #: Photographs from which errors have intervals.
 MIN_UNITS = 5
+
+SOURCES = ("photographs", "simulated")
 
 #: The dimension of photographs, or simulated scenes.
 UNIT = "unit"
@@ -878,14 +869,12 @@ class SolvedQuantile(Statistic[Poses]):
     percent: int = 50
     ratio: bool = False
 
-    @property
-    def below(self) -> str:
-        """Name of the number of errors (unit,) at or below it, minus the expected number."""
-        return f"{self.name}_below"
-
     def outputs(self) -> Sequence[Output]:
-        """Return the quantile with its interval, and what each unit has below it."""
-        return [*super().outputs(), Output(self.below, "", "1", dims=(UNIT,))]
+        """Return the quantile with its interval, and what each unit has below it.
+
+        That is the number of errors (unit,) at or below it, minus the expected number.
+        """
+        return [*super().outputs(), Output(f"{self.name}_below", "", "1", dims=(UNIT,))]
 
     def arrays(self, columns: Columns[Poses], design: estimator.Design) -> Sequence[NDArray[Any]]:
         """Return these; without an interval of fewer than `MIN_UNITS` units."""
@@ -1004,7 +993,7 @@ def simulation_gap(
         # Trials of the same index are then of the same photograph.
         trials = _trials_of(photographs, simulated)
         some = np.flatnonzero((trials >= 0).any(axis=1))
-        at = xr.DataArray(trials[some], dims=(DRAWS, REPEAT))
+        at = xr.DataArray(trials[some], dims=(DRAWS, "repeat"))  # of one photograph
         first, second = first.isel({DRAWS: some}), _gathered(second, at)
         if std is not None:
             second = _with_uncertain_truth(second, _gathered(std, at), kept)
@@ -1037,9 +1026,9 @@ def _gap(
     each: ComparedRate | SolvedQuantile, first: xr.Dataset, second: xr.Dataset, *, paired: bool
 ) -> Sequence[xr.DataArray]:
     """Return the difference or ratio of a statistic in two tables, with its interval."""
-    correlation: Any = 0.0
-    if paired and isinstance(each, SolvedQuantile):
-        correlation = xr.corr(first[each.below], second[each.below], UNIT).fillna(0.0)
+    below, correlation = f"{each.name}_below", xr.DataArray(0.0)
+    if paired and below in first:
+        correlation = xr.corr(first[below], second[below], UNIT).fillna(0.0)
     one, other = ([table[f"{each.name}{end}"] for end in INTERVAL] for table in (first, second))
     if not each.ratio:
         return difference_interval(one, other, correlation)

@@ -101,11 +101,6 @@ def stopping_rule(results: xr.Dataset) -> StoppingRule | None:
     return None if pipeline is None else pipeline.stopping
 
 
-def is_sampling_stopped(results: xr.Dataset) -> bool:
-    """Return whether a dataset is of a pipeline whose sampling stops when results suffice."""
-    return stopping_rule(results) is not None
-
-
 def _run_metadata(results: xr.Dataset) -> Mapping[str, Any]:
     """Return the record of its run in a dataset's attributes.
 
@@ -483,7 +478,7 @@ BOUND_INPUTS = (*ERROR_INPUTS, "bound_std")
 
 
 def pose_arrays(results: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataArray]:
-    """Return a dataset's variables by name.
+    """Return a dataset's variables by name; of true positions without rotations z alone.
 
     Raises
     ------
@@ -498,7 +493,10 @@ def pose_arrays(results: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataA
     if lacking:
         raise DatasetError(f"no variable {lacking}; "
                            f"there are {', '.join(map(str, results.data_vars)) or 'none'}")
-    return {name: results[name] for name in names}
+    arrays = {name: results[name] for name in names}
+    if "true_tvec_m" in arrays and "true_rvec" not in arrays:  # `Poses.percent_of_depth`
+        arrays["true_tvec_m"] = arrays["true_tvec_m"].isel(xyz=slice(2, None))
+    return arrays
 
 
 class Poses:
@@ -598,7 +596,7 @@ class Poses:
     def percent_of_depth(self, length: NDArray[Any]) -> Floats:
         """Return lengths (...) in percent of the true z."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return 100.0 * np.asarray(length / self["true_tvec_m"][..., 2], dtype=np.float64)
+            return 100.0 * np.asarray(length / self["true_tvec_m"][..., -1], dtype=np.float64)
 
     # Errors along axes and about angles, signed: estimated minus true.
     #
@@ -694,23 +692,24 @@ class Poses:
 
 
 def is_none_of(flags: NDArray[np.uint8], values: Sequence[int]) -> Masks:
-    """Return where flags have none of a few values; `numpy.isin` takes five times as long."""
+    """Return where flags (..., settings) have none of some values.
+
+    `numpy.isin` takes five times as long.
+    """
+    # Flags of detection are the same for all solvers, repeated without having memory of their own.
+    once = flags if flags.strides[-1:] != (0,) else flags[..., :1]
     # NumPy compares with a plain number as bytes, with an enumeration's member as int64.
-    return functools.reduce(np.logical_and, (flags != int(value) for value in values))
+    none = functools.reduce(np.logical_and, (once != int(value) for value in values))
+    return np.broadcast_to(none, flags.shape)
 
 
 def norm_squared(vectors: NDArray[Any]) -> Floats:
-    """Return the squared norms of (..., components)."""
-    return component_sum(np.square(vectors, dtype=np.float64))
-
-
-def component_sum(vectors: Floats) -> Floats:
-    """Return the sums of the few components of (..., components), bit for bit as NumPy does.
+    """Return the squared norms of (..., components), bit for bit as NumPy's sum of squares.
 
     NumPy's loop along a short last axis takes three times as long.
     """
-    components = (vectors[..., k] for k in range(vectors.shape[-1]))
-    return np.asarray(functools.reduce(np.add, components, np.zeros(())))
+    return functools.reduce(np.add, (
+        np.square(vectors[..., k], dtype=np.float64) for k in range(vectors.shape[-1])))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -864,7 +863,7 @@ def sampling_text(results: xr.Dataset) -> str:
 
     An example is ``stopped by [search]: along = distance_m, max_trials = 240``.
     """
-    if not is_sampling_stopped(results):
+    if stopping_rule(results) is None:
         return ""
     table = read_document(str(results.attrs["pipeline"]))[SEARCH]
     keys = ", ".join(f"{key} = {shown(value)}" for key, value in table.items())

@@ -762,8 +762,7 @@ def _check_solved(moments: Floats, results: xr.Dataset, kept: Sequence[str]) -> 
 
 def _metres(distance_m: Floats) -> Floats:
     """Return the factors of errors (quantities, distances): of positions the distances."""
-    scale = np.where(np.arange(len(QUANTITIES)) < 3, 1.0, 0.0)[:, None]
-    return np.asarray(scale * distance_m + (1.0 - scale))
+    return np.where(np.arange(len(QUANTITIES))[:, None] < 3, distance_m, 1.0)
 
 
 def _of_region(model: Sequence[Sights], directions: Floats, trials: int) -> Values:

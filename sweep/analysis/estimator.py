@@ -16,7 +16,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
+from functools import cached_property
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -24,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special, stats
 
 from sweep.analysis import dataset
-from sweep.analysis.dataset import COMMON, DRAWS, INSIDE, Poses, component_sum
+from sweep.analysis.dataset import COMMON, DRAWS, INSIDE, Poses, norm_squared
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.schema import LABELS, cf_attributes
@@ -34,16 +35,9 @@ from sweep.typing import Floats, Integers, Masks
 Arrays = dict[str, NDArray[Any]]
 
 
-class DrawnPoses(Protocol):
-    """A view of a block's poses: what statistics read."""
-
-    @property
-    def run(self) -> Masks:
-        """Which poses were run: (groups, cells, draws, settings)."""
-        ...
-
-
-ViewT = TypeVar("ViewT", bound=DrawnPoses)
+#: A view of a block's poses, which statistics read; it has the mask ``run`` of those that were run.
+ViewT = TypeVar("ViewT", bound=Any)
+ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
 
 #: Arrays (groups, cells, draws, ...) of a block's view and its groups.
@@ -79,7 +73,7 @@ def wilson(successes: ArrayLike, n: ArrayLike, level: float = LEVEL) -> tuple[Fl
     >>> low.round(4).tolist(), high.round(4).tolist()
     ([0.0, 0.0624], [0.1611, 0.1605])
     """
-    successes, n = _counts(successes, n)
+    successes, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(n, float))
     kappa = float(np.sqrt(2.0) * special.erfinv(level))  # keeps the digits of any level
     with np.errstate(all="ignore"):
         spread = kappa * np.sqrt(successes * ((n - successes) / n) + kappa**2 / 4)
@@ -103,17 +97,11 @@ def clopper_pearson(
     >>> low.round(4).tolist(), high.round(4).tolist()
     ([0.0, 0.0005], [0.0711, 0.1065])
     """
-    successes, n = _counts(successes, n)
+    successes, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(n, float))
     tail, failures = (1.0 - level) / 2.0, n - successes
     low = special.betaincinv(np.maximum(successes, 1.0), failures + 1.0, tail)
     high = special.betainccinv(successes + 1.0, np.maximum(failures, 1.0), tail)
     return _with_exact_ends(successes, n, low, high)
-
-
-def _counts(successes: ArrayLike, n: ArrayLike) -> tuple[Floats, Floats]:
-    """Return the counts as float64 of one shape."""
-    successes, n = np.broadcast_arrays(np.asarray(successes, np.float64), np.asarray(n, np.float64))
-    return successes, n
 
 
 def _with_exact_ends(
@@ -169,6 +157,14 @@ MAX_THREADS = 4
 MAX_SLICES = 8
 
 
+def in_threads(function: Callable[[ItemT], ResultT], items: Sequence[ItemT]) -> list[ResultT]:
+    """Return the results of a function of each item; NumPy's loops run side by side."""
+    if len(items) == 1:
+        return [function(items[0])]
+    with ThreadPoolExecutor(min(MAX_THREADS, len(os.sched_getaffinity(0)))) as threads:
+        return list(threads.map(function, items))
+
+
 class Columns(Generic[ViewT]):
     """The poses of some groups, read in blocks along groups, cells and draws.
 
@@ -196,23 +192,21 @@ class Columns(Generic[ViewT]):
 
     def map(self, function: Callable[[ViewT, tuple[slice, ...]], ResultT]) -> list[ResultT]:
         """Return the results of a function of each block's view and place."""
-        def of_block(number: int) -> ResultT:
-            return function(self._view_of(number), self._blocks[number])
+        return in_threads(lambda number: function(self._view_of(number), self._blocks[number]),
+                          range(len(self._blocks)))
 
-        if len(self._blocks) == 1:
-            return [of_block(0)]
-        with ThreadPoolExecutor(min(MAX_THREADS, len(os.sched_getaffinity(0)))) as threads:
-            return list(threads.map(of_block, range(len(self._blocks))))
+    @cached_property
+    def run(self) -> Masks:
+        """Which draws were run, (groups, cells, draws)."""
+        return np.asarray(self.by_draw(lambda poses, _: [poses.run])[0] > 0)
 
     def _view_of(self, number: int) -> ViewT:
         """Return the view of a block; of few poses all statistics share it, and what it keeps."""
-        if number not in self._views:
-            cut = self._blocks[number]
-            view = self._view({name: array[cut] for name, array in self._arrays.items()})
-            if self.poses > MAX_SHARED:
-                return view
+        view = self._views.get(number) or self._view({
+            name: array[self._blocks[number]] for name, array in self._arrays.items()})
+        if self.poses <= MAX_SHARED:
             self._views[number] = view
-        return self._views[number]
+        return view
 
     def joined(self, function: Parts[ViewT]) -> list[NDArray[Any]]:
         """Return arrays (groups, cells, draws, ...) of all blocks.
@@ -233,10 +227,23 @@ class Columns(Generic[ViewT]):
         """Return the sums over settings (groups, cells, draws, ...) of arrays of poses.
 
         ``function`` gives arrays (groups, cells, draws, settings, ...) of a block's view and its
-        groups. Sums of masks are counts, int32; all others are float64.
+        groups. Sums of masks are counts, of the smallest type; all others are float64.
         """
         return self.joined(
             lambda view, groups: [sum_of_settings(each) for each in function(view, groups)])
+
+
+def zero_unless(mask: Masks, values: Floats) -> Floats:
+    """Return values where a mask is true, else 0, as `numpy.where`, which takes five times as long.
+
+    Its branch cannot be foreseen; here the mask is a number of 64 bits that are all set or none.
+
+    Examples
+    --------
+    >>> zero_unless(np.array([True, False]), np.array([1.5, np.nan])).tolist()
+    [1.5, 0.0]
+    """
+    return (-mask.astype(np.int64) & values.view(np.int64)).view(np.float64)
 
 
 def sum_of_settings(array: NDArray[Any]) -> NDArray[Any]:
@@ -247,7 +254,7 @@ def sum_of_settings(array: NDArray[Any]) -> NDArray[Any]:
     >>> sum_of_settings(np.array([[[[True, True], [False, True]]]])).tolist()
     [[[2, 1]]]
     """
-    dtype = np.dtype(np.int32 if array.dtype.kind == "b" else np.float64)
+    dtype = np.min_scalar_type(array.shape[3]) if array.dtype.kind == "b" else np.dtype("f8")
     if not 0 < array.shape[3] < MAX_SLICES:
         return np.asarray(array.sum(axis=3, dtype=dtype))
     with np.errstate(all="ignore"):  # of infinite errors of both signs it is NaN
@@ -348,7 +355,7 @@ class Design:
         with np.errstate(all="ignore"):
             rate = successes / n
             counted = np.ones_like(used, dtype=bool) if of_points else used > 0
-            units, m2 = ratio_terms(hits - rate[:, None, None] * used, counted)
+            units, m2 = ratio_terms(hits, used, rate, counted)
             variance = (m2 * units / (units - 1.0)).sum(axis=1) / n**2
             freedom = np.maximum(units.max(axis=1, initial=0.0) - 1.0, 1.0)
             shrink = (special.ndtri(tail) / special.stdtrit(freedom, tail)) ** 2
@@ -376,12 +383,12 @@ class Sample:
 
     used: Integers
 
-    @property
+    @cached_property
     def n(self) -> Integers:
         """Poses (groups,), times pooled settings."""
         return np.asarray(self.used.sum(axis=(1, 2), dtype=np.int64))
 
-    @property
+    @cached_property
     def draws(self) -> Integers:
         """Number of draws (groups,) that the poses are worth.
 
@@ -389,15 +396,15 @@ class Sample:
         it is less, for those with more of them count more: the effective sample size,
         (Σ m)² / Σ m² of m poses a draw, rounded down (Kish, "Survey Sampling", 1965, section 11.7).
         """
-        squares = np.square(self.used, dtype=np.float64).sum(axis=(1, 2))
+        squares = np.einsum("gcd,gcd->g", self.used, self.used, dtype=np.float64)
         return whole(self.n.astype(np.float64) ** 2 / np.maximum(squares, 1.0))
 
-    @property
+    @cached_property
     def freedom(self) -> Integers:
         """Degrees of freedom (groups,): the draws beyond the first of each cell."""
         return np.asarray(np.maximum((self.used > 0).sum(axis=2) - 1, 0).sum(axis=1))
 
-    @property
+    @cached_property
     def drawn(self) -> Masks:
         """Whether any cell has two draws, so that intervals exist; (groups,)."""
         return np.asarray(self.freedom > 0)
@@ -438,18 +445,27 @@ class MeanEstimate(NamedTuple):
     freedom: Floats
 
 
-def ratio_terms(residuals: Floats, counted: Masks) -> tuple[Integers, Floats]:
-    """Return the number of draws and the residuals' sum of squared deviations, (groups, cells).
+def ratio_terms(
+    values: NDArray[Any], used: Integers, ratio: Floats, counted: Masks
+) -> tuple[Integers, Floats]:
+    """Return the number of draws and their residuals' sum of squared deviations, (groups, cells).
 
-    ``residuals`` and the draws that are ``counted`` are (groups, cells, draws).
+    ``values``, ``used`` and the draws that are ``counted`` are (groups, cells, draws), the ratio of
+    the sums of both is (groups,).
     """
     units = counted.sum(axis=2)
-    with np.errstate(all="ignore"):
-        rests = np.where(counted, residuals, 0.0)
-        # In place: of 10^7 poses such an array has 40 MB.
-        rests -= (rests.sum(axis=2) / np.maximum(units, 1))[..., None]
-        rests[~counted] = 0.0
-        return units, np.square(rests, out=rests).sum(axis=2)
+
+    def squares(start: int) -> Floats:
+        cut = np.s_[:, start : start + step]
+        with np.errstate(all="ignore"):
+            rests = zero_unless(counted[cut], values[cut] - ratio[:, None, None] * used[cut])
+            rests -= (rests.sum(axis=2) / np.maximum(units[cut], 1))[..., None]
+            return np.asarray(np.square(zero_unless(counted[cut], rests)).sum(axis=2))
+
+    # Some cells at a time stay in the processor's cache.
+    groups, cells, draws = counted.shape
+    step = max(MAX_BLOCK // max(groups * draws, 1), 1)
+    return units, np.concatenate(in_threads(squares, range(0, max(cells, 1), step)), axis=1)
 
 
 #: Value, low and high, each (groups,).
@@ -640,19 +656,19 @@ class Sums(NamedTuple):
 
     Attributes
     ----------
+    run
+        Whether the draw was run (groups, cells, draws).
     values
         Sums of the values (groups, cells, draws, components).
     used
         How many count (groups, cells, draws).
-    run
-        Whether the draw was run (groups, cells, draws).
     largest
         The largest first component (groups, cells, draws); -inf of none; where it is asked for.
     """
 
+    run: Masks
     values: Floats
     used: Integers
-    run: Masks
     largest: Floats = np.empty(0)
 
     @property
@@ -671,8 +687,7 @@ class Sums(NamedTuple):
         """
         n, most = Sample(self.used).n, Sample(self.used).freedom
         with np.errstate(all="ignore"):
-            residuals = mean[:, None, None] * self.used
-            units, m2 = ratio_terms(np.subtract(values, residuals, out=residuals), self.run)
+            units, m2 = ratio_terms(values, self.used, mean, self.run)
             rest, m2 = np.maximum(units - 1.0, 0.0), np.where(units > 1, m2, 0.0)
             terms = (rest + 1.0) * m2 / np.maximum(rest, 1.0)  # n_c s_c²
             variance = terms.sum(axis=1)
@@ -718,16 +733,14 @@ class Mean(Statistic[ViewT]):
                 np.logical_or, (np.isnan(values[..., k]) for k in range(values.shape[-1])))
             used = np.asarray(self.used(poses) & ~missing)
             if centre is not None:
-                values = component_sum(
-                    np.square(values - centre[groups, None, None, None]))[..., None]
-            sums = [np.where(used[..., None], values, 0.0), used, poses.run]
+                values = norm_squared(values - centre[groups, None, None, None])[..., None]
+            sums = [zero_unless(used[..., None], values), used]
             if largest:
                 sums.append(np.where(used, values[..., 0], -np.inf).max(
                     axis=3, initial=-np.inf)[..., None])
             return sums
 
-        values, used, run, *largest_values = columns.by_draw(parts)
-        return Sums(values, used, run > 0, *largest_values)
+        return Sums(columns.run, *columns.by_draw(parts))
 
 
 class MeanLength(Mean[ViewT]):
@@ -750,8 +763,7 @@ class MeanLength(Mean[ViewT]):
         with np.errstate(all="ignore"):
             direction = np.where(
                 length[:, None] > 0.0, mean / length[:, None], np.eye(1, components))
-        along = np.einsum("gcdk,gk->gcd", sums.values, direction)
-        estimate = sums.estimate(length, along)
+        estimate = sums.estimate(length, np.einsum("gcdk,gk->gcd", sums.values, direction))
         length, low, high = symmetric(estimate, level)
         rest = estimate.freedom - (components - 1)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -807,15 +819,11 @@ class PositiveMean(Mean[ViewT]):
         sums = self.scores(columns, largest=of_points)
         sample = Sample(sums.used)
         # A draw with all its poses may be unseen, or a point of the replicates.
-        draws: Floats | Integers
-        if of_points:
-            draws, largest = sample.n / design.points, sums.largest
-        else:
-            draws = sample.freedom + 1
-            largest = np.divide(sums.values[..., 0], sums.used, where=sums.used > 0,
-                                out=np.full(sums.used.shape, -np.inf))
-        most = largest.max(axis=(1, 2), initial=-np.inf)
-        del largest  # of 10^7 poses it has 80 MB
+        draws: Floats | Integers = sample.n / design.points if of_points else sample.freedom + 1
+        with np.errstate(all="ignore"):  # NaN of a draw of which none counts
+            most = np.fmax.reduce(
+                sums.largest if of_points else sums.values[..., 0] / sums.used,
+                axis=(1, 2), initial=-np.inf)
         estimate = sums.estimate(sums.mean[:, 0], sums.values[..., 0])
         value, low, high = symmetric(estimate, level)
         with np.errstate(all="ignore"):
@@ -858,8 +866,8 @@ class StandardDeviation(RootMeanSquare[ViewT]):
         n = Sample(sums.used).n[:, None, None]
         with np.errstate(all="ignore"):
             factor = n / (n - 1.0)
-            return sums._replace(values=sums.values * factor[..., None],
-                                 largest=sums.largest * factor if largest else sums.largest)
+            np.multiply(sums.values, factor[..., None], out=sums.values)
+            return sums._replace(largest=sums.largest * factor) if largest else sums
 
 
 # --------------------------------------------------------------------------------------------------
@@ -898,13 +906,13 @@ class FlipMixture(Statistic[Poses]):
         """Return the root mean square and its interval."""
         level = design.level(self.level)
 
-        def mean(used: Callable[[Poses], Masks]) -> PositiveMean[Poses]:
-            return PositiveMean("", "", self.squares, used, unseen_factor=self.unseen_factor)
-
+        mean = functools.partial(
+            PositiveMean[Poses], "", "", self.squares, unseen_factor=self.unseen_factor)
         square = mean(self.used).sums(columns).mean[:, 0]
         _, u_low, u_high = mean(lambda poses: poses.unflipped).interval(columns, design, level)
         _, v_low, v_high = mean(lambda poses: poses.flipped).interval(columns, design, level)
-        lows = _first_known(u_low, v_low), _first_known(v_low, u_low)
+        lows = [np.nan_to_num(np.where(np.isnan(one), other, one), nan=0.0)
+                for one, other in ((u_low, v_low), (v_low, u_low))]
         highs = [np.fmin(high, self.bound**2) for high in (u_high, v_high)]
         sample, hits, draws = FLIPS.worth(columns, design, LEVEL)
         shares = outward(clopper_pearson, hits, sample.n, draws, level)
@@ -914,11 +922,6 @@ class FlipMixture(Statistic[Poses]):
         ends = [np.where(sample.drawn, each, np.nan)
                 for each in (np.fmin(low, square), np.fmax(high, square))]
         return [np.sqrt(each) for each in (square, *ends)]
-
-
-def _first_known(first: Floats, second: Floats) -> Floats:
-    """Return the first that is not NaN of each, or 0."""
-    return np.nan_to_num(np.where(np.isnan(first), second, first), nan=0.0)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -1201,7 +1204,7 @@ def arranged(
     stopped: bool | None = None,
 ) -> tuple[Arrays, Design]:
     """Return a dataset's columns (groups, cells, draws, settings, ...), and the draws' design."""
-    stopped = dataset.is_sampling_stopped(results) if stopped is None else stopped
+    stopped = dataset.stopping_rule(results) is not None if stopped is None else stopped
     if stopped:
         inputs = {COMMON: dataset.common_trials(results, inputs, kept), **inputs}
     sizes = {name: results.sizes[name] for name in kept}
@@ -1211,7 +1214,7 @@ def arranged(
     draws = [name for name in pooled if name == DRAWS]
     cells = [name for name in pooled if name != DRAWS and dataset.is_grid_axis(name, results)]
     settings = [name for name in pooled if name not in (*cells, *draws)]
-    axes = {"groups": kept, "cells": cells, "draws": draws, "settings": settings}
+    axes = [[*kept], cells, settings, draws]
     order = dataset.replicate_order(results, draws)
     unit: Unit = "replicate" if order is not None else (
         "photograph" if dataset.of_photographs(results) else "trial")
@@ -1221,25 +1224,39 @@ def arranged(
 
 
 def _column(
-    array: xr.DataArray, axes: Mapping[str, Sequence[str]], sizes: Mapping[str, int],
+    array: xr.DataArray, axes: Sequence[Sequence[str]], sizes: Mapping[str, int],
     order: NDArray[np.intp] | None,
 ) -> NDArray[Any]:
-    """Return the values of an array along axes that are of several dimensions each.
+    """Return the values of an array, (groups, cells, draws, settings, ...).
 
-    ``order`` are the indices of the trials by replicate, if they have such.
+    ``axes`` are the dimensions of groups, cells, settings and draws; ``order`` the indices of the
+    trials by replicate, if they have such.
     """
-    # Of dimensions that make an axis together an array has all, or is repeated along all.
-    own = {axis: part for axis, part in axes.items() if set(part) & set(array.dims)}
+    # In memory each component is by itself, and the draws of a setting are side by side: NumPy's
+    # loops along a short last axis are slow. So arranged, nothing is copied once it is read.
     inner = {str(dim): size for dim, size in array.sizes.items() if dim not in sizes}
-    shape = {axis: math.prod(sizes[name] for name in part) for axis, part in axes.items()}
+    dims = [dim for dim in (*inner, *itertools.chain(*axes)) if dim in array.dims]
+    read: Any = xr.Variable(dims, np.empty([array.sizes[dim] for dim in dims], array.dtype))
+    target = read.transpose(*array.dims).values
     try:
-        variable: Any = xr.Variable(array.dims, array.to_numpy())
+        # Of Dask a part at a time: together they would be in memory twice.
+        lengths = array.chunks[0] if array.chunks else ()
+        for end, length in zip(np.cumsum(lengths, dtype=int), lengths, strict=True):
+            target[end - length : end] = array[end - length : end].to_numpy()
+        if not lengths:
+            target[...] = array.to_numpy()
     except (RuntimeError, ValueError) as error:  # Zarr's, of a chunk that is damaged
         raise DatasetError(
             f"a store cannot be read: {error}; `sweep verify` names what is damaged") from None
-    whole = variable.set_dims({name: sizes[name] for part in own.values() for name in part} | inner)
-    values: NDArray[Any] = whole.stack(own).set_dims(shape | inner).to_numpy()
+    # Of dimensions that make an axis together an array has all, or is repeated along all.
+    own = [axis if set(axis) & set(dims) else [] for axis in axes]
+    values = read.set_dims({dim: {**inner, **sizes}[dim] for dim in (
+        *inner, *itertools.chain(*own))}).to_numpy().reshape(*inner.values(), *(
+            math.prod(sizes[dim] for dim in axis) for axis in own))
+    values = np.broadcast_to(values, (*inner.values(), *(
+        math.prod(sizes[dim] for dim in axis) for axis in axes)))
+    values = np.moveaxis(values, range(len(inner), values.ndim), (0, 1, 3, 2))
     if order is None:
         return values
-    points = shape["draws"] // REPLICATES * shape["settings"]  # of a replicate, together
-    return values[:, :, order].reshape((*values.shape[:2], REPLICATES, points, *values.shape[4:]))
+    # Of a replicate, all points and their settings together.
+    return values[:, :, order].reshape((*values.shape[:2], REPLICATES, -1, *inner.values()))

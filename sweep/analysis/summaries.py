@@ -268,7 +268,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     cells = [name for name in dataset.axes_of(results) if name in results["detection"].dims
              and name not in (*kept, DRAWS) and dataset.is_grid_axis(name, results)]
     inputs = dataset.pose_arrays(results, dataset.DETECTION_INPUTS)
-    if dataset.is_sampling_stopped(results):
+    if dataset.stopping_rule(results) is not None:
         inputs[dataset.COMMON] = dataset.common_trials(results, inputs, kept)
     rate = replace(DETECTION_RATE, counts=(LOOKED_FOR, ("detected", "")))
     (table,), (counts,) = (estimator.aggregates(results, inputs, names, [[rate]], Poses)

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.bench_scale import receipt_of
 from benchmarks.tables import header, row
 from support.small_datasets import perfect, with_every_flag
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import VARIABLES
 from sweep.measure.flags import EstimateStatus
-from sweep.store.blocks import region
-from sweep.store.lifecycle import create_store
+from sweep.store.blocks import write_block
+from sweep.store.lifecycle import create_store, write_groups
 
 POSES = 10**7
 
@@ -65,12 +65,12 @@ QUICK = {"POSES": 10**4, "CALLS": dict(list(CALLS.items())[:2])}
 CHILD = """
 import json, sys, time
 import numpy as np
-import xarray as xr
+import sweep
 from sweep.analysis import (ambiguity, compare, detection_rate, error_statistics,
                             failure_composition, flip_rate, marker_ranking, requirement_limits)
 AREAS = np.geomspace(100, 40_000, 13)
 begun = time.perf_counter()
-results = xr.open_zarr(sys.argv[1], consolidated=False)  # no block has a receipt
+results = sweep.open(sys.argv[1])
 table = {call}
 done = time.perf_counter()
 assert "looked_for" not in table or table["looked_for"].sum() > 0  # the store was read
@@ -88,7 +88,7 @@ def write_store(folder, poses):
     store = create_store(
         str(Path(folder) / f"{poses}.zarr"), pipeline, (*EXTENTS, min(TRIALS_A_CHUNK, trials)))
     rng = np.random.default_rng(1)
-    for block in store.blocks:
+    for number, block in enumerate(store.blocks):
         *scene, draws = block.shape
         sizes = dict(zip(DIMS, (*scene, 2, draws), strict=True))
         values = with_every_flag(rng, perfect(rng, sizes), good=0.9)
@@ -96,8 +96,9 @@ def write_store(folder, poses):
         for name in ("reprojection_error_px", "alternative_reprojection_error_px"):
             values[name] = solved.dims, rng.uniform(0.1, 1.0, solved.shape)
             values[name] = values[name].where(solved)
-        for name in values:
-            store.array(name)[region(VARIABLES[name], pipeline, block)] = values[name].values
+        contents = {each.name: values.get(each.name, each.fill) for each in store.variables}
+        write_block(store, block, contents, receipt_of(store, number, 0.0))
+    write_groups(store, {}, counts={})
     return store.url, trials * POSES_A_TRIAL
 
 

@@ -71,14 +71,16 @@ def test_a_set_of_views_gives_the_camera_of_a_plain_loop(results):
         assert one["rms_px"].item() == pytest.approx(rms, rel=1e-3)
 
 
-def test_errors_of_positions_are_those_that_solve_pnp_makes_with_the_camera(results):
-    one = camera_calibrations(results, [12], coefficients=1, target_m=2.0).isel(views=0, set=0)
+@pytest.mark.parametrize("target_m", [0.5, 2.0])
+def test_errors_of_positions_are_those_that_solve_pnp_makes_with_the_camera(target_m, results):
+    one = camera_calibrations(
+        results, [12], coefficients=1, target_m=target_m).isel(views=0, set=0)
     truth = np.array([300.0, 300.0, 159.5, 119.5, -0.1, 0, 0, 0, 0])
     line = np.linspace(-0.1, 0.1, 5)
     target = np.array([[x, y, 0.0] for y in line for x in line])
     turn = np.array([np.pi, 0.0, 0.0])
     for k, bearing in enumerate(([0.0, 0.0], [0.8 * 159.5 / 300, 0.8 * 119.5 / 300])):
-        position = 2.0 * np.array([*bearing, 1.0])
+        position = target_m * np.array([*bearing, 1.0])
         cameras = [(np.array([[each[0], 0, each[2]], [0, each[1], each[3]], [0, 0, 1]]), each[4:])
                    for each in (truth, truth + one["intrinsic_error"].values)]
         pixels, _ = cv2.projectPoints(target, turn, position, *cameras[0])

@@ -1,6 +1,7 @@
 """OpenCV's detector is set as asked, sees the right window, and keeps its known conventions."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from sweep.measure.detectors import (
     ALIGNMENT_PX,
     MIN_WINDOW_PX,
     REFINEMENTS,
+    BoardDetectorSetting,
     DetectorSetting,
     SearchOutput,
     make_detector,
@@ -23,6 +25,7 @@ from sweep.measure.detectors import (
     windows,
 )
 from sweep.measure.flags import DetectionStatus
+from sweep.measure.sources import ImageSearch
 from sweep.model.board import single_marker
 from sweep.model.exposure import marker_boxes
 from sweep.model.marker import marker_count, module_count, opencv_dictionary_names
@@ -113,6 +116,20 @@ def test_corners_of_an_upright_square_follow_opencvs_known_conventions(refinemen
     a, b = CONVENTIONS[refinement]
     # 0.01 px: contour's float32 line fit, and the two digits of subpix' convention.
     np.testing.assert_allclose(corners[0][0], [[a, a], [b, a], [b, b], [a, b]], atol=0.01)
+
+
+def test_a_photograph_is_searched_once_a_dictionary():
+    image = np.full((200, 200), 255, np.uint8)
+    known = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_50)
+    image[50:146, 50:146] = cv2.aruco.generateImageMarker(known, 7, 96)
+    targets = [single_marker(f"DICT_{name}_50", 7, 0.2) for name in ("6X6", "6X6", "4X4")]
+    search = ImageSearch(
+        DetectorSetting(), BoardDetectorSetting(), SimpleNamespace(frame=np.full((3, 2), 200)),
+        SimpleNamespace(targets=targets))
+    first, second, other = (search(row, image) for row in range(3))
+    assert second is first
+    assert first.ids == [7]
+    assert other.ids is None
 
 
 @pytest.mark.parametrize("dictionary", opencv_dictionary_names())

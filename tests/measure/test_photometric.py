@@ -22,6 +22,7 @@ from support.lengths import first_of
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Estimates
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.likelihood import MAX_SHIFT, MAX_TURN, POSITION, moved_state, state_of
 from sweep.measure.photometric import Photometric
 from sweep.model.board import single_marker
 from sweep.model.scene import Targets
@@ -52,6 +53,16 @@ def run(trials, *settings, seed=1, folder="."):
     result = run_cells(pipeline(*settings, seed=seed, folder=folder), [rows])
     assert not result.failures, result.failures[0].text
     return result.columns
+
+
+@pytest.mark.parametrize("k", range(6))
+def test_a_step_turns_and_shifts_a_pose_no_farther_than_its_limits(k):
+    state = state_of(np.eye(3), np.array([0.1, 0.2, 2.0]), 0.0, np.zeros(3))
+    moved = moved_state(state, 10.0 * np.eye(6)[k], 0.0)
+    shift = np.linalg.norm((moved - state)[POSITION]) / 2.0  # of the depth
+    turn = math.acos((moved[:9] @ np.eye(3).ravel() - 1.0) / 2.0)
+    np.testing.assert_allclose([turn, shift], [MAX_TURN, 0] if k < 3 else [0, MAX_SHIFT],
+                               atol=1e-7)
 
 
 class Cell:

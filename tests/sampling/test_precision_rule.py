@@ -103,3 +103,5 @@ def test_no_fewer_draws_than_are_told_make_an_interval_as_narrow(width):
     widths = [clopper_pearson(0, n, stopped_level(LEVEL))[1] / 2 for n in (fewest - 1, fewest)]
     assert widths[1] <= width < widths[0]
     assert wanted_precisions({"rotation_rmse_deg": width})[0][0].fewest_draws == 450
+    quantile = wanted_precisions({"rotation_p95_deg": width})[0][0].fewest_draws
+    assert 0.95**quantile <= (1.0 - stopped_level(LEVEL)) / 2.0 < 0.95 ** (quantile - 1)

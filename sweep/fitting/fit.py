@@ -118,7 +118,7 @@ def jackknife(function: Callable[[Integers], Floats], count: int) -> list[Estima
 # in scenes.
 #
 # Two sums of a photograph's squares or products of shifts say s and l (the method of moments). The
-# farther the field reaches, the smaller is the first one beside the second. The logarithms of s and
+# farther the field reaches, the larger is the second one beside the first. The logarithms of s and
 # l have the jackknife's intervals.
 
 class Field(NamedTuple):
@@ -149,7 +149,7 @@ def field_of(photographs: Sequence[tuple[Floats, Floats]], lengths_px: Floats) -
     """Return the field that has each photograph's two sums (2,) of squares, px².
 
     Beside them there are the sums (2, L) expected of fields of standard deviation 1 px, and of L
-    correlation lengths; the first over the second one falls with the length.
+    correlation lengths; the second over the first one rises with the length.
     """
     at = np.log(lengths_px)
     sums, shares = (np.array(each) for each in zip(*photographs, strict=True))
@@ -157,13 +157,14 @@ def field_of(photographs: Sequence[tuple[Floats, Floats]], lengths_px: Floats) -
     def matched(rows: Integers) -> Floats:
         """Return the logarithms of standard deviation and length, (2,)."""
         found, expected = sums[rows].sum(axis=0), shares[rows].sum(axis=0)
-        first, second = np.maximum(found, 1e-12)
-        rising = -np.log(expected[0] / expected[1])
-        length = float(np.interp(-np.log(first / second), rising, at))
+        rising = np.maximum.accumulate(expected[1] / expected[0])
+        length = float(np.interp(found[1] / max(found[0], 1e-12), rising, at))
         total = np.interp(length, at, expected.sum(axis=0))
         return np.array([0.5 * math.log(max(float(found.sum()), 1e-12) / total), length])
 
     size, length = jackknife(matched, len(sums))
+    if length.value in at[[0, -1]]:  # It may be beyond: no interval is known.
+        length = Estimate(length.value)
     expected = [np.interp(length.value, at, each.sum(axis=0)) for each in shares]
     return Field(
         size.mapped(math.exp), length.mapped(math.exp), estimate(sums.sum(axis=1) / expected)
@@ -174,10 +175,13 @@ def field_of(photographs: Sequence[tuple[Floats, Floats]], lengths_px: Floats) -
 # Shifts of single edges beside the marker's corners, from the residuals of pixels near edges.
 #
 # A module's edge that is shifted by d along the unit vector n leaves the residuals d (n · slope).
-# Edges of both polarities that are shifted alike are a field of shifts; edges that all move
-# towards white are the marker's own bloom, which is taken off. An edge's shift is the field's mean
-# along a module. Its variance, and the covariance with the next edge on the same line, say how far
-# the field reaches: about a module.
+# Edges of both polarities that are shifted alike are a field of shifts. The shifts of a marker's
+# edges are (1 - P) (field's means along modules + noise), P being the projection on the changes by
+# the marker's own parameters, which took up much of what is smooth, and by its own bloom, which
+# moves all edges towards white. Squares, and products of nearest parallel edges, say how far the
+# field reaches: about a module. The nearest ones are the next ones on a line of modules, and those
+# beside them on the next lines. A print whose lines lie at whole pixels of a printer or a screen
+# moves the former alike and the latter apart, a field moves both alike.
 
 #: Half widths across and along the edge of the pixels that say where a module's edge is.
 REACH_MODULES, ALONG_MODULES = 0.5, 0.4
@@ -186,67 +190,65 @@ REACH_MODULES, ALONG_MODULES = 0.5, 0.4
 STEP_SHARE = 0.6
 
 #: Correlation lengths that are compared, in modules.
-EDGE_LENGTHS = np.geomspace(0.1, 3.0, 60)
+EDGE_LENGTHS = np.geomspace(0.25, 3.0, 40)
 
-#: Least correlation length of a field of edges' shifts.
-MIN_LENGTH_PX = 1.0
+#: Lines of modules between edges of both directions, which are taken for independent.
+FAR = 1000
 
 
 def edge_field(fits: Sequence[PhotographFit]) -> Field:
     """Return the field of shifts of edges in photographs."""
-    t = ALONG_MODULES * ((np.arange(16) + 0.5) / 8 - 1)
-    apart = np.array([0.0, 1.0])[:, None, None, None]
-    # Squares of means along a module, and their products with those along the next one.
-    means = np.exp(
-        -0.5 * ((t[:, None] - t - apart) / EDGE_LENGTHS[:, None, None]) ** 2
-    ).mean(axis=(2, 3))
     known = [
-        (sums, counts[:, None] * means) for sums, counts in map(edge_sums, fits)
-        if (counts > 0).all()
+        sums for fit in fits
+        if np.isfinite(fit.noise).any() and (sums := edge_sums(fit))[1].any()
     ]
-    if not known:
-        return Field()
     module_px = np.mean([state.marker.module_px for fit in fits for state in fit.states])
-    field = field_of(known, EDGE_LENGTHS * module_px)
-    return field._replace(length_px=field.length_px.mapped(lambda px: max(px, MIN_LENGTH_PX)))
+    return field_of(known, EDGE_LENGTHS * module_px) if known else Field()
 
 
 def edge_sums(fit: PhotographFit) -> tuple[Floats, Floats]:
-    """Return sums (2,) of products of shifts of a photograph's edges in px², and their counts (2,).
+    """Return sums (2,) of a photograph's edges' shifts, px², and the shares (2, L) of fields.
 
-    First of squares, less the share of the pixels' noise; their count is the degrees of freedom.
-    Then of two edges on one line of modules that follow on each other.
+    Of their squares, and of the products of nearest parallel edges; the expected share of the
+    pixels' noise is taken off.
     """
     variance = float(np.nanmean(fit.noise)) + QUANTISATION_VARIANCE
-    sums, counts = np.zeros(2), np.zeros(2)
+    sums, shares = np.zeros(2), np.zeros((2, len(EDGE_LENGTHS)))
     for state in fit.states:
-        shifts = [_edges_along(state, axis) for axis in range(2)]
-        bright = np.concatenate([each[0].ravel() for each in shifts])
-        information = np.concatenate([each[2].ravel() for each in shifts])
-        count = int(np.isfinite(bright).sum())
-        if count <= OWN:
+        shifts, information, line, module, normal, own = map(
+            np.concatenate, zip(_edges_along(state, 0), _edges_along(state, 1), strict=True)
+        )
+        if len(shifts) <= OWN + 1:
             continue
-        own = float(np.nanmean(bright))
-        # Corners and bloom took up as much of the squares as of independent shifts' ones, and,
-        # being smooth, about as much of the products of neighbours.
-        taken = (CORNERS + 1) / count
-        squares = float(np.nansum((bright - own) ** 2 - variance / information))
-        sums[0] += squares
-        counts[0] += count * (1 - taken)
-        for towards_white, direction, _ in shifts:
-            shifted = (towards_white - own) * direction
-            following = shifted[:, :-1] * shifted[:, 1:]
-            pairs = np.isfinite(following).sum()
-            sums[1] += np.nansum(following) + pairs * taken * squares / (count * (1 - taken))
-            counts[1] += pairs
-    return sums, counts
+        weighted = own.T * information
+        left = np.eye(len(own)) - own @ np.linalg.pinv(weighted @ own, hermitian=True) @ weighted
+        alike = normal @ normal.T
+        across, along = (np.abs(np.subtract.outer(each, each)) for each in (line, module))
+        nearest = 0.5 * alike * (across + along == 1)
+        for k, form in enumerate((left.T @ left, left.T @ nearest @ left)):
+            sums[k] += shifts @ form @ shifts - (np.diag(form) * variance / information).sum()
+            shares[k] += [
+                (form * alike * _along_modules(across, along, each)).sum() for each in EDGE_LENGTHS
+            ]
+    return sums, shares
 
 
-def _edges_along(state: MarkerState, axis: int) -> Floats:
-    """Return the edges (3, lines, modules) on lines of constant column (``axis`` 0) or row.
+def _along_modules(across: Floats, along: Floats, length: float) -> Floats:
+    """Return the correlation of means along modules' edges, at distances (n, n) in modules.
 
-    NaN where there is no edge: shifts towards white in px, the sign of that
-    direction along the axis, and the information of the shifts.
+    Means are, nearly, the field smoothed by a Gaussian of their variance.
+    """
+    wide = length**2 + 2 * (2 * ALONG_MODULES) ** 2 / 12
+    exponent = across**2 / length**2 + along**2 / wide
+    return np.asarray(length / math.sqrt(wide) * np.exp(-0.5 * exponent))
+
+
+def _edges_along(state: MarkerState, axis: int) -> tuple[Any, ...]:
+    """Return the edges on lines of constant column (``axis`` 0) or row.
+
+    Their shifts (n,) towards white in px, and the information of these; the numbers of line and
+    module, of rows beyond those of columns; the directions (n, 2) towards white; and what the
+    marker's own parameters, and its own bloom, change of the shifts (n, 11).
     """
     marker = state.marker
     across, along = marker.modules * marker.at[axis], marker.modules * marker.at[1 - axis]
@@ -255,23 +257,25 @@ def _edges_along(state: MarkerState, axis: int) -> Floats:
         (np.abs(across - line) < REACH_MODULES) & (np.abs(along - module - 0.5) < ALONG_MODULES)
         & (line >= 0) & (line <= marker.modules) & (module >= 0) & (module < marker.modules)
     )
-    shape = marker.modules + 1, marker.modules
     number = (line * marker.modules + module)[near].astype(np.int64)
     slope, residuals = state.slope[:, near], state.residuals[near]
-    total = partial(np.bincount, number, minlength=shape[0] * shape[1])
+    total = partial(np.bincount, number, minlength=(marker.modules + 1) * marker.modules)
     steps = np.stack([total(each) for each in slope])
     length = np.hypot(*steps)
     normal = steps / np.maximum(length, 1e-12)
     by_shift = (normal[:, number] * slope).sum(axis=0)
-    information = total(by_shift**2)
     whole = abs(state.levels[1]) * 2 * ALONG_MODULES * marker.module_px
-    edge = length > STEP_SHARE * whole
-    with np.errstate(invalid="ignore", divide="ignore"):
-        shifts = np.where(edge, total(by_shift * residuals) / information, np.nan)
-    corners = marker.corners_px
-    positive = corners[1] - corners[0] if axis == 0 else corners[3] - corners[0]
-    found = np.stack([shifts, np.sign(positive @ normal), information])
-    return np.where(edge, found, np.nan).reshape(3, *shape)
+    edge = np.flatnonzero(length > STEP_SHARE * whole)
+    information = total(by_shift**2)[edge]
+    shifts, *own = (
+        total(by_shift * each)[edge] / information
+        for each in (residuals, *state.jacobian[near, :OWN].T)
+    )
+    line, module = np.divmod(edge, marker.modules)
+    return (
+        shifts, information, line + FAR * axis, module, normal[:, edge].T,
+        np.column_stack([*own, np.ones(len(edge))]),
+    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -357,21 +361,25 @@ def _geometry_sums(
     centres = np.kron(np.eye(count), np.tile(np.eye(2), 4) / 2)
     parts = (residual - centres.T @ centres @ residual, centres @ residual)
     forms = [part.T @ part for part in parts]
-    noises, points, *weights = zip(*(_corners(each, fit.noise) for each in fit.states), strict=True)
-    moved = [block_diag(*each) for each in weights]
-    every = np.concatenate(points)
+    noises, points, *moved = (np.array(each) for each in zip(
+        *(_corners(state, fit.noise) for state in fit.states), strict=True
+    ))
+    every = points.reshape(-1, 2)
     distances = ((every[:, None] - every[None]) ** 2).sum(axis=2)
 
-    def sums(covariance: Floats) -> Floats:
-        """Return the expected share of a field of shifts in both sums of squares."""
-        shifted = sum(each @ covariance @ each.T for each in moved)
-        return np.array([float((form * shifted).sum()) for form in forms])
+    def sums(covariance: Floats, noise: Floats | float = 0.0) -> Floats:
+        """Return the expected share of a field of shifts, and noise, in both sums of squares."""
+        # Corners move with the cells of their own marker: products marker by marker.
+        rows = covariance.reshape(count, -1, len(every))
+        shifted = np.hstack(sum(
+            (each @ rows).reshape(size, count, -1).swapaxes(0, 1) @ each.swapaxes(1, 2)
+            for each in moved
+        ))
+        return np.array([float((form * (shifted + noise)).sum()) for form in forms])
 
-    cell_px = float(np.mean([
-        state.marker.modules * state.marker.module_px for state in fit.states
-    ])) / CELLS
-    of_noise = np.array([float((form * block_diag(*noises)).sum()) for form in forms])
-    added = sums(edges.covariance(distances, cell_px)) + of_noise
+    cells_px = [each.marker.modules * each.marker.module_px / CELLS for each in fit.states]
+    of_edges = edges.covariance(distances, float(np.mean(cells_px)))
+    added = sums(of_edges, block_diag(*noises))
     return np.array([shifts @ form @ shifts for form in forms]) - added, np.stack([
         sums(np.exp(-0.5 * distances / length**2)) for length in lengths_px
     ], axis=1)

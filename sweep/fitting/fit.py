@@ -118,8 +118,9 @@ def jackknife(function: Callable[[Integers], Floats], count: int) -> list[Estima
 # in scenes.
 #
 # Two sums of a photograph's squares or products of shifts say s and l (the method of moments). The
-# farther the field reaches, the larger is the second one beside the first. The logarithms of s and
-# l have the jackknife's intervals.
+# farther the field reaches, the larger is the second one beside the first. The reciprocals of s
+# and l have the jackknife's intervals: of few photographs they are less skew than s and l, and
+# an upper end of infinity is one that they do not limit.
 
 class Field(NamedTuple):
     """A field of shifts: standard deviation, correlation length, and whether there is one.
@@ -155,20 +156,21 @@ def field_of(photographs: Sequence[tuple[Floats, Floats]], lengths_px: Floats) -
     sums, shares = (np.array(each) for each in zip(*photographs, strict=True))
 
     def matched(rows: Integers) -> Floats:
-        """Return the logarithms of standard deviation and length, (2,)."""
+        """Return minus the reciprocals of standard deviation and length, (2,)."""
         found, expected = sums[rows].sum(axis=0), shares[rows].sum(axis=0)
         rising = np.maximum.accumulate(expected[1] / expected[0])
         length = float(np.interp(found[1] / max(found[0], 1e-12), rising, at))
         total = np.interp(length, at, expected.sum(axis=0))
-        return np.array([0.5 * math.log(max(float(found.sum()), 1e-12) / total), length])
+        return -np.array([math.sqrt(total / max(float(found.sum()), 1e-12)), math.exp(-length)])
 
-    size, length = jackknife(matched, len(sums))
-    if length.value in at[[0, -1]]:  # It may be beyond: no interval is known.
-        length = Estimate(length.value)
-    expected = [np.interp(length.value, at, each.sum(axis=0)) for each in shares]
-    return Field(
-        size.mapped(math.exp), length.mapped(math.exp), estimate(sums.sum(axis=1) / expected)
+    size, length = (
+        each.mapped(lambda inverse: -1 / inverse if inverse < 0 else math.inf)
+        for each in jackknife(matched, len(sums))
     )
+    if np.isclose(length.value, lengths_px[[0, -1]]).any():  # Beyond, maybe: without an interval.
+        length = Estimate(length.value)
+    expected = [np.interp(math.log(length.value), at, each.sum(axis=0)) for each in shares]
+    return Field(size, length, estimate(sums.sum(axis=1) / expected))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -198,10 +200,8 @@ FAR = 1000
 
 def edge_field(fits: Sequence[PhotographFit]) -> Field:
     """Return the field of shifts of edges in photographs."""
-    known = [
-        sums for fit in fits
-        if np.isfinite(fit.noise).any() and (sums := edge_sums(fit))[1].any()
-    ]
+    known = [edge_sums(fit) for fit in fits if np.isfinite(fit.noise).any()]
+    known = [each for each in known if each[1].any()]
     module_px = np.mean([state.marker.module_px for fit in fits for state in fit.states])
     return field_of(known, EDGE_LENGTHS * module_px) if known else Field()
 

@@ -57,7 +57,7 @@ BLOCK_TASK = "sweep.execution.block_task"
 
 
 class ChildError(Exception):
-    """A call in a child process has no result: by its message, it raised, or see below.
+    """A call in a child process has no result: it raised (the message is the traceback), or died.
 
     Attributes
     ----------

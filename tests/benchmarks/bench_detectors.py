@@ -91,6 +91,6 @@ def main():
                 try:
                     errors, seconds = child.call(searched, name, SCENES, noise, limit_s=3600)
                 except ChildDiedError as death:
-                    row(name, f"ended its process: {death}")
+                    row(name, str(death))
                 else:
                     row(name, *line(errors, seconds, np.random.default_rng(4)))

@@ -1,12 +1,10 @@
-"""The cell that ends its process is found: blocks are cut until one cell is left."""
+"""The cell that ends its process is found: blocks are cut until one scene, and a part, is left."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import time
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,7 +23,7 @@ from sweep.store.blocks import selected
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
-# Cells that crash their process or never return, isolated in child processes.
+# Scenes that crash their process or never return, isolated in child processes.
 #
 # The rest of the block is computed all the same. Of a block's time limit, its worker has a quarter,
 # before that ends itself (:data:`WHOLE`). Then each call in a child has a share of what is left
@@ -35,28 +33,18 @@ from sweep.typing import Masks
 
 WHOLE, SHARE, LEAST = 1 / 4, 1 / 6, 1 / 32
 
-#: How many fresh processes a cell must end, one after another, to be flagged; one that ends a
-#: process is enough for the other cells of its scene.
+#: How many fresh processes a part of a scene must end, one after another, to be flagged.
 DEATHS = 3
 
 #: Least time limit of a call.
 MIN_S = 1.0
 
-#: Into how many pieces cells are cut that crashed a process together.
+#: Into how many pieces scenes are cut that crashed a process together.
 PIECES = 64
 
 
 def _run(pipeline: Pipeline, *arguments: Any) -> CellsResult:
     return run_cells(pipeline.experiment, *arguments)
-
-
-def _pieces(cells: NDArray[np.intp], configurations: int) -> list[NDArray[np.intp]]:
-    """Cut cells, by their numbers in order, into whole scenes; those of one scene into cells."""
-    units = np.split(cells, np.flatnonzero(np.diff(cells // configurations)) + 1)
-    if len(units) == 1:
-        units = np.split(cells, len(cells))
-    size = math.ceil(len(units) / PIECES)
-    return [np.concatenate(units[k : k + size]) for k in range(0, len(units), size)]
 
 
 @machine_faults_raised()
@@ -68,11 +56,10 @@ def run_cells_isolated(
 ) -> CellsResult:
     """Compute cells as `sweep.evaluation.block.run_cells` does, also if they crash their process.
 
-    A cell that ends each of :data:`DEATHS` child processes is flagged ``crashed``, one that raises
-    as a whole ``failed``: its detection if the search alone ends so, too, else the estimate. A
-    signal from outside, such as the system sends to a process that uses too much memory, is the
-    machine's fault. All other cells have the same values as in one call, bit for bit: what worked
-    alone does not depend on what else its scene has.
+    A detection or estimate that ends each of :data:`DEATHS` child processes is flagged ``crashed``,
+    one that raises as a whole ``failed``. A signal from outside, such as the system sends to a
+    process that uses too much memory, is the machine's fault. All others have the same values as in
+    one call, bit for bit: what worked alone does not depend on what else its scene has.
 
     Parameters
     ----------
@@ -89,12 +76,11 @@ def run_cells_isolated(
     ------
     MachineFaultError
         If no child process can be started, one raises what no scene's data can cause, or one that
-        computes a single cell is ended by a signal from outside.
+        computes a part of a single scene is ended by a signal from outside.
     """
     end = time.monotonic() + (1 - WHOLE) * limit_s
     result = CellsResult.not_run(pipeline.experiment, len(need))
-    lost: dict[tuple[int, int, int], Failure] = {}
-    deaths = Counter[tuple[int, int, int]]()  # of processes that computed one cell alone
+    flags, nothing = result.columns, np.zeros_like(need[:1])
 
     def run(rows: NDArray[np.intp], *masks: Masks) -> None:
         """Call ``run_cells`` for scenes ``rows`` (n,) and masks of them; take over the results."""
@@ -103,52 +89,62 @@ def run_cells_isolated(
             _run, pipeline, [index[rows] for index in indices], *masks, limit_s=share_s)
         result.take(pipeline.experiment, part, rows)
 
-    def compute(cells: NDArray[np.intp]) -> None:
-        """Compute cells by their numbers; those that end the process in smaller pieces."""
-        for piece in _pieces(cells, need[0].size):
-            wanted = np.zeros_like(need)
-            wanted.flat[piece] = True
-            rows = np.unique(piece // need[0].size)
+    def compute(scenes: NDArray[np.intp]) -> None:
+        """Compute scenes in pieces; those that end the process in smaller ones."""
+        for piece in np.array_split(scenes, min(PIECES, len(scenes))):
             try:
-                run(rows, wanted[rows])
-            except ChildError as error:
+                run(piece, need[piece])
+            except ChildError:
                 if len(piece) > 1:
                     compute(piece)
-                    continue
-                died = isinstance(error, ChildDiedError)
-                row, k, j = (int(at) for at in np.argwhere(wanted)[0])
-                failure = Failure(row, "estimation", str(error), k, j, crashed=died)
-                deaths[row, k, j] += 1
-                if error.from_outside:
-                    at = selected(pipeline, [int(index[row]) for index in indices], failure)
-                    raise local_fault(f"{error.line}; the scene is --at {at}") from None
-                if died and deaths[row, k, j] < DEATHS and not any(at[0] == row for at in lost):
-                    compute(piece)
                 else:
-                    lost[row, k, j] = failure
+                    compute_parts(int(piece[0]))
+
+    def compute_parts(row: int) -> None:
+        """Compute a scene: its parameters and truth, each search, each estimate."""
+        with contextlib.suppress(ChildError):
+            run(np.array([row]), nothing)
+        for k in np.flatnonzero(need[row].any(axis=1)).tolist():
+            search = np.arange(need.shape[1])[None] == k
+            unseen = lost(Failure(row, "detection", "", k), nothing, search)
+            if unseen:
+                flags["detection"][k][row] = DetectionStatus[unseen]
+            for j in np.flatnonzero(need[row, k]).tolist():
+                number, only = k * need.shape[2] + j, nothing.copy()
+                only[0, k, j] = True
+                unsolved = unseen or lost(Failure(row, "estimation", "", k, j), only, search)
+                if unsolved:
+                    for name, flag in WITHOUT_DETECTION.items():
+                        flags[name][number][row] = flag
+                if unsolved and not unseen:
+                    flags["estimate"][number][row] = EstimateStatus[unsolved]
+
+    def lost(part: Failure, *masks: Masks) -> str:
+        """Compute a part of a scene, named as its failure would be.
+
+        Returns
+        -------
+        "crashed" or "failed" if there are no results, which is noted; nothing otherwise.
+        """
+        for _ in range(DEATHS):
+            try:
+                run(np.array([part.scene]), *masks)
+            except ChildError as error:
+                if error.from_outside:
+                    at = selected(pipeline, [int(i[part.scene]) for i in indices], part)
+                    raise local_fault(f"{error.line}; the scene is --at {at}") from None
+                died = isinstance(error, ChildDiedError)
+                failure = dataclasses.replace(part, text=str(error), crashed=died)
+                if not died:
+                    break
+            else:
+                return ""
+        result.failures.append(failure)
+        return "crashed" if failure.crashed else "failed"
 
     with Child() as child:
-        compute(np.flatnonzero(need))
-        # Of a lost cell, its search alone; if that dies, the scene's parameters and truth alone.
-        for row, k in dict.fromkeys((row, k) for row, k, _ in lost):
-            nothing = np.zeros_like(need[:1])
-            for searched in (np.arange(need.shape[1]) == k, nothing[0, :, 0]):
-                with contextlib.suppress(ChildError):
-                    run(np.array([row]), nothing, searched[None])
-                    break
-    flags = result.columns
-    unseen = flags["detection"] == DetectionStatus.not_run
-    for (row, k, j), failure in lost.items():
-        kind, number = "crashed" if failure.crashed else "failed", k * need.shape[2] + j
-        for name, flag in WITHOUT_DETECTION.items():
-            flags[name][number, row] = flag
-        if unseen[k, row]:
-            flags["detection"][k, row] = DetectionStatus[kind]
-            result.failures.append(dataclasses.replace(failure, stage="detection", estimator=None))
-        else:
-            flags["estimate"][number, row] = EstimateStatus[kind]
-            result.failures.append(failure)
-    # Cells that were computed apart tell the same of what they share.
+        compute(np.arange(len(need)))
+    # Parts that were computed apart tell the same of what they share.
     result.failures = list({
         dataclasses.replace(each, text=""): each for each in result.failures}.values())
     return result

@@ -146,6 +146,12 @@ def test_image_is_the_clipped_area_before_the_background_rounded_once(count, on_
 
 # The approximate renderers.
 
+def test_half_a_level_rounds_up_beside_a_marker_and_at_the_corners_of_its_box():
+    value = values(side_px=40.0, roll_deg=45.0, background=127.5)
+    left, top, _, bottom = scene_of(value)[1].tolist()
+    assert (frame_of(value)[[0, top, bottom - 1], [0, left, left]] == 128).all()
+
+
 def paper_image(value):
     """Steps 5-8 of the paper, on the whole frame: the corners, the transform, the warp."""
     white = modules_of(value)

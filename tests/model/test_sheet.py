@@ -113,14 +113,16 @@ def assert_sampled(found, expected, per_side):
     assert abs(np.mean(found - expected)) < 0.03 * deviation + 0.01
 
 
-@pytest.mark.parametrize(("distortion", "hidden_share", "hidden_deg"), [
-    *((lens, 0.0, 0.0) for lens in LENSES),
-    ((), 0.3, 30.0), ((), 0.9, -100.0), (LENSES[0], 0.5, 200.0),
+@pytest.mark.parametrize(("distortion", "hidden_share", "hidden_deg", "levels"), [
+    *((lens, 0.0, 0.0, {}) for lens in LENSES),
+    ((), 0.3, 30.0, {}), ((), 0.9, -100.0, {}), (LENSES[0], 0.5, 200.0, {}),
+    ((), 0.3, 30.0, {"background": 240.0, "white": 240.0}),  # the sheet hides the quiet zone, too
 ])
 def test_an_image_under_a_lens_or_a_sheet_is_that_of_samples_traced_back(
-    distortion, hidden_share, hidden_deg
+    distortion, hidden_share, hidden_deg, levels
 ):
     value, _ = scenes_of(
+        **levels,
         distortion=distortion, tilt_deg=35.0, azimuth_deg=70.0, roll_deg=25.0, bearing_x_deg=8.0,
         quiet_zone_modules=1.5, occlusion=hidden_share, occlusion_deg=hidden_deg, occluder=170.0,
     )

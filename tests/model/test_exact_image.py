@@ -202,7 +202,8 @@ def test_supersampled_image_is_near_the_exact_one(count, distortion, renderer):
     # levels for each edge in the pixel. Measured over the pixels with an edge, long form: worst
     # 18, rms 2.0 regular and 2.7 jittered, mean below 0.05.
     errors = []
-    for value in drawn_poses(count, 9, (20, 100), 80, distortion=distortion, fx_px=500.0):
+    lens = {"distortion": distortion, "fx_px": 500.0, "fy_px": 440.0}
+    for value in drawn_poses(count, 9, (20, 100), 80, **lens):
         mean, share = levels_of(value | {"renderer": renderer}) - levels_of(value)
         errors.append((mean - share * value["background"])[np.abs(mean) + np.abs(share) > 1e-9])
     error = np.concatenate(errors)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.evaluation.block import run_cells
+from sweep.evaluation.block import run_cells, warm_up
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.results import CellsResult, Failure
 from sweep.evaluation.variables import WITHOUT_DETECTION
@@ -29,7 +29,7 @@ from sweep.typing import Masks
 # before that ends itself (:data:`WHOLE`). Then each call in a child has a share of what is left
 # (:data:`SHARE`), so that isolating a scene that never returns keeps within the limit; and not less
 # than a share of it all (:data:`LEAST`), since there are other scenes after some that never return.
-# No limit runs while code is compiled or loaded.
+# No limit runs while a child starts, or code is compiled or loaded.
 
 WHOLE, SHARE, LEAST = 1 / 4, 1 / 6, 1 / 32
 
@@ -38,6 +38,9 @@ DEATHS = 3
 
 #: Least time limit of a call.
 MIN_S = 1.0
+
+#: How long a child may take to start and to load code.
+START_S = 300.0
 
 #: Into how many pieces scenes are cut that crashed a process together.
 PIECES = 64
@@ -82,11 +85,22 @@ def run_cells_isolated(
     result = CellsResult.not_run(pipeline.experiment, len(need))
     flags, nothing = result.columns, np.zeros_like(need[:1])
 
+    def start() -> None:
+        """Start a child and load code there."""
+        try:
+            child.call(warm_up, pipeline, limit_s=START_S)
+        except ChildError as error:
+            raise local_fault(f"a child process computed nothing: {error.line}") from None
+
     def run(rows: NDArray[np.intp], *masks: Masks) -> None:
         """Call ``run_cells`` for scenes ``rows`` (n,) and masks of them; take over the results."""
         share_s = max(SHARE * (end - time.monotonic()), LEAST * limit_s, MIN_S)
-        part = child.call(
-            _run, pipeline, [index[rows] for index in indices], *masks, limit_s=share_s)
+        try:
+            part = child.call(
+                _run, pipeline, [index[rows] for index in indices], *masks, limit_s=share_s)
+        except ChildDiedError:
+            start()
+            raise
         result.take(pipeline.experiment, part, rows)
 
     def compute(scenes: NDArray[np.intp]) -> None:
@@ -143,6 +157,7 @@ def run_cells_isolated(
         return "crashed" if failure.crashed else "failed"
 
     with Child() as child:
+        start()
         compute(np.arange(len(need)))
     # Parts that were computed apart tell the same of what they share.
     result.failures = list({

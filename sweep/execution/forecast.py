@@ -41,9 +41,6 @@ MAX_BATCH = 1536
 #: By how much a batch may exceed the one before: a few scenes may cost far more than the others.
 GROWTH = 8
 
-#: How long a measurement may compile; its own limit stands still meanwhile.
-COMPILATION_LIMIT_S = 900.0
-
 #: Assumed cost of a scene if the measurement crashes or raises.
 UNMEASURED_S = 0.01
 
@@ -114,7 +111,7 @@ def measure(child: Child, pipeline: Pipeline) -> Timing:
     are is seen by their blocks.
     """
     try:
-        return child.call(timed, pipeline, limit_s=TIMING_LIMIT_S, grace_s=COMPILATION_LIMIT_S)
+        return child.call(timed, pipeline, limit_s=TIMING_LIMIT_S)
     except (ChildError, MachineFaultError) as error:
         over = isinstance(error, ChildError) and error.timed_out
         return Timing(TIMING_LIMIT_S, 1, over=True) if over else Timing(UNMEASURED_S, 0)

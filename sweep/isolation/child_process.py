@@ -46,8 +46,9 @@ def default_workers() -> int:
 # The two are connected by a pair of sockets. Only what these two processes of one program send each
 # other is unpickled.
 
-#: How long after its limit a child that did not end itself is killed: it may start slowly.
-GRACE_S = 300.0
+#: How long after its limit a child that did not end itself is killed: it may start slowly, and
+#: compile, while the limit stands still.
+GRACE_S = 600.0
 
 #: How often a child looks whether its caller still lives.
 PARENT_S = 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import time
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.results import CellsResult, Failure
 from sweep.evaluation.variables import WITHOUT_DETECTION
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Child, ChildDiedError, ChildError
+from sweep.isolation.child_process import GRACE_S, Child, ChildDiedError, ChildError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import local_fault
 from sweep.store.blocks import selected
@@ -38,9 +37,6 @@ DEATHS = 3
 
 #: Least time limit of a call.
 MIN_S = 1.0
-
-#: How long a child may take to start and to load code.
-START_S = 300.0
 
 #: Into how many pieces scenes are cut that crashed a process together.
 PIECES = 64
@@ -88,7 +84,7 @@ def run_cells_isolated(
     def start() -> None:
         """Start a child and load code there."""
         try:
-            child.call(warm_up, pipeline, limit_s=START_S)
+            child.call(warm_up, pipeline, limit_s=GRACE_S)
         except ChildError as error:
             raise local_fault(f"a child process computed nothing: {error.line}") from None
 
@@ -116,11 +112,10 @@ def run_cells_isolated(
 
     def compute_parts(row: int) -> None:
         """Compute a scene: its parameters and truth, each search, each estimate."""
-        with contextlib.suppress(ChildError):
-            run(np.array([row]), nothing)
+        unmade = lost(Failure(row, "scene", ""), nothing)
         for k in np.flatnonzero(need[row].any(axis=1)).tolist():
             search = np.arange(need.shape[1])[None] == k
-            unseen = lost(Failure(row, "detection", "", k), nothing, search)
+            unseen = unmade or lost(Failure(row, "detection", "", k), nothing, search)
             if unseen:
                 flags["detection"][k][row] = DetectionStatus[unseen]
             for j in np.flatnonzero(need[row, k]).tolist():
@@ -147,9 +142,9 @@ def run_cells_isolated(
                 if error.from_outside:
                     at = selected(pipeline, [int(i[part.scene]) for i in indices], part)
                     raise local_fault(f"{error.line}; the scene is --at {at}") from None
-                died = isinstance(error, ChildDiedError)
-                failure = dataclasses.replace(part, text=str(error), crashed=died)
-                if not died:
+                failure = dataclasses.replace(
+                    part, text=str(error), crashed=isinstance(error, ChildDiedError))
+                if not failure.crashed:
                     break
             else:
                 return ""

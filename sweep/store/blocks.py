@@ -453,8 +453,11 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
 
     for variable, (template, _) in store.chunks.items():
         names = numbered(template)
-        for name in names.keys() - files.list_folder(store.storage, variable):
-            missing.setdefault(names[name], f"{variable}/{name}")
+        absent = {f"{variable}/{name}": names[name]
+                  for name in names.keys() - files.list_folder(store.storage, variable)}
+        # A listing may be older than a file, as over NFS: what it lacks is looked for.
+        found = zip(absent.items(), files.read_files(store.storage, [*absent]), strict=True)
+        missing |= {number: key for (key, number), content in found if content is None}
     return missing
 
 

@@ -75,7 +75,7 @@ def delete_folder(storage: Store, folder: str) -> None:
     if isinstance(storage, LocalStore):
         sync(storage.delete_dir(folder))
         return
-    keys = list_files(storage, f"{folder}/")
+    keys = [*collect_aiterator(storage.list_prefix(f"{folder}/"))]
     for start in range(0, len(keys), DELETED_AT_ONCE):
         sync(delete_all(keys[start : start + DELETED_AT_ONCE]))
 
@@ -102,14 +102,9 @@ def list_folder(storage: Store, folder: str) -> list[str]:
     return []
 
 
-def list_files(storage: Store, prefix: str = "") -> list[str]:
-    """Return the keys of all files below a prefix."""
-    return [*collect_aiterator(storage.list_prefix(prefix))]
-
-
 def files_in(storage: Store) -> dict[str, bytes]:
     """Return the contents of all files of a storage by key."""
-    keys = list_files(storage)
+    keys = [*collect_aiterator(storage.list())]
     return {key: content or b"" for key, content in zip(
         keys, read_files(storage, keys), strict=True)}
 

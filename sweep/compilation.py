@@ -14,10 +14,13 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numba
-
-from sweep.errors import MachineFaultError
+from sweep.errors import MachineFaultError, RunError
 from sweep.messages import local_fault
+
+try:
+    import numba
+except (ValueError, TypeError) as error:  # it reads its configuration while it is imported
+    raise RunError(f"Numba cannot be imported with its NUMBA_... variables: {error}") from None
 
 #: Rooms with compiled functions.
 ROOMS = ("model", "measure", "fitting")

@@ -1239,11 +1239,12 @@ def _column(
     read: Any = xr.Variable(dims, np.empty([array.sizes[dim] for dim in dims], array.dtype))
     target = read.transpose(*array.dims).values
     try:
-        # Of Dask a part at a time: together they would be in memory twice.
-        lengths = array.chunks[0] if array.chunks else ()
-        for end, length in zip(np.cumsum(lengths, dtype=int), lengths, strict=True):
-            target[end - length : end] = array[end - length : end].to_numpy()
-        if not lengths:
+        # Of Dask a part at a time: together they would be in memory twice. Few parts, for each
+        # looks through the names of all chunks.
+        ends = np.cumsum(array.chunks[0], dtype=int).tolist() if array.chunks else []
+        for start, end in itertools.pairwise([0, *ends[: -1 : len(ends) // 16 or 1], *ends[-1:]]):
+            target[start:end] = array[start:end].to_numpy()
+        if not ends:
             target[...] = array.to_numpy()
     except (RuntimeError, ValueError) as error:  # Zarr's, of a chunk that is damaged
         raise DatasetError(

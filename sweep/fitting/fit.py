@@ -164,7 +164,7 @@ def field_of(photographs: Sequence[tuple[Floats, Floats]], lengths_px: Floats) -
         return -np.array([math.sqrt(total / max(float(found.sum()), 1e-12)), math.exp(-length)])
 
     size, length = (
-        each.mapped(lambda inverse: -1 / inverse if inverse < 0 else math.inf)
+        each.mapped(lambda inverse: math.inf if inverse >= 0 else -1 / inverse)
         for each in jackknife(matched, len(sums))
     )
     if np.isclose(length.value, lengths_px[[0, -1]]).any():  # Beyond, maybe: without an interval.

@@ -225,11 +225,10 @@ def edge_sums(fit: PhotographFit) -> tuple[Floats, Floats]:
         alike = normal @ normal.T
         across, along = (np.abs(np.subtract.outer(each, each)) for each in (line, module))
         nearest = 0.5 * alike * (across + along == 1)
+        correlations = [_along_modules(across, along, each) for each in EDGE_LENGTHS]
         for k, form in enumerate((left.T @ left, left.T @ nearest @ left)):
             sums[k] += shifts @ form @ shifts - (np.diag(form) * variance / information).sum()
-            shares[k] += [
-                (form * alike * _along_modules(across, along, each)).sum() for each in EDGE_LENGTHS
-            ]
+            shares[k] += [(form * alike * each).sum() for each in correlations]
     return sums, shares
 
 

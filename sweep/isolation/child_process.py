@@ -135,8 +135,7 @@ class Child(contextlib.AbstractContextManager["Child"]):
         self.close()
 
     def call(
-        self, function: Callable[..., Result], *arguments: Any, limit_s: float,
-        grace_s: float = GRACE_S,
+        self, function: Callable[..., Result], *arguments: Any, limit_s: float
     ) -> Result:
         """Call a function of a module in the child and return its result.
 
@@ -146,8 +145,6 @@ class Child(contextlib.AbstractContextManager["Child"]):
             The call; it is pickled, so a function of a module.
         limit_s
             Time limit in seconds; it stands still while code is compiled.
-        grace_s
-            How long after its limit a child that did not end itself is killed, in seconds.
 
         Raises
         ------
@@ -161,7 +158,7 @@ class Child(contextlib.AbstractContextManager["Child"]):
             self._start()
         started, begun = time.monotonic(), False
         # It bounds sending, too: a child that hangs while it imports reads nothing.
-        last = threading.Timer(limit_s + grace_s, self._process.kill)
+        last = threading.Timer(limit_s + GRACE_S, self._process.kill)
         last.start()
         try:
             self._connection.send((function, arguments, limit_s))
@@ -171,7 +168,7 @@ class Child(contextlib.AbstractContextManager["Child"]):
             took_s, code = time.monotonic() - started, self._process.wait()
             self.close()
             # The child ends itself with status 1 (`watchdog.ending_after`).
-            timed_out = took_s >= limit_s + (0.0 if code == 1 else grace_s)
+            timed_out = took_s >= limit_s + (0.0 if code == 1 else GRACE_S)
             how = f"time limit of {limit_s:.3g} s" if timed_out else (
                 f"exit status {code}" if code >= 0 else signal.Signals(-code).name)
             raise ChildDiedError(how, begun=begun, timed_out=timed_out) from None

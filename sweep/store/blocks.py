@@ -451,7 +451,7 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
     def numbered(template: str) -> dict[str, int]:
         return {template.format(*index): number for number, index in indices.items()}
 
-    for variable, (template, _) in store.chunks.items():
+    for variable, (template, _) in store.chunks.items() if indices else ():
         names = numbered(template)
         absent = {f"{variable}/{name}": names[name]
                   for name in names.keys() - files.list_folder(store.storage, variable)}

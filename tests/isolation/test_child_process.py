@@ -11,6 +11,7 @@ import pytest
 
 from sweep.errors import PipelineError, StoreError
 from sweep.experiment.pipeline import Pipeline
+from sweep.isolation import child_process
 from sweep.isolation.child_process import Child, ChildDiedError, ChildError
 
 pytestmark = pytest.mark.system
@@ -53,8 +54,9 @@ def test_child_that_dies_says_how(function, arguments, limit_s, how):
 def test_call_that_a_child_does_not_read_ends_in_time(tmp_path, monkeypatch):
     (tmp_path / "stuck.py").write_text("import time\ntime.sleep(600)\n")
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(child_process, "GRACE_S", 0.2)
     with Child("stuck") as child, pytest.raises(ChildDiedError, match="time limit"):
-        child.call(np.negative, np.zeros(3_000_000), limit_s=0.2, grace_s=0.2)
+        child.call(np.negative, np.zeros(3_000_000), limit_s=0.2)
 
 
 def test_child_runs_nothing_that_lies_in_the_current_folder(tmp_path):

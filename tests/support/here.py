@@ -18,8 +18,8 @@ class Here:
     def __exit__(self, *_):
         pass
 
-    def call(self, function, *arguments, limit_s, grace_s=1.0):
-        assert limit_s > 0 < grace_s
+    def call(self, function, *arguments, limit_s):
+        assert limit_s > 0
         return function(*arguments)
 
     def close(self):

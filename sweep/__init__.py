@@ -26,6 +26,7 @@ from sweep.errors import (
     SweepError,
     path_of,
 )
+from sweep.execution.progress import Progress, RunOptions, taking_run_options
 from sweep.isolation.child_process import Child
 from sweep.messages import notice
 from sweep.version import __version__
@@ -36,8 +37,7 @@ if TYPE_CHECKING:
     from sweep.analysis.dataset import decode_flags
     from sweep.diagnosis.detection import error_model
     from sweep.diagnosis.diagnosis import diagnose
-    from sweep.execution.progress import Progress
-    from sweep.execution.runner import RunOptions, limit
+    from sweep.execution.runner import limit
     from sweep.experiment.pipeline import Pipeline
     from sweep.fitting.fit import fit
     from sweep.report.findings import measure_tradeoff, require
@@ -58,7 +58,7 @@ experiment.quantity_faults = lambda texts, names: (  # noqa: PLW0108  (imported 
 
 #: Modules of the library by the public names that are imported from them.
 _IMPORTED_ON_USE = {
-    "Pipeline": "pipeline", "Progress": "progress", "decode_flags": "dataset",
+    "Pipeline": "pipeline", "decode_flags": "dataset",
     "diagnose": "diagnosis", "error_model": "detection", "fit": "fit", "limit": "runner",
     "measure_tradeoff": "findings", "reference": "reference", "require": "findings",
     "size": "choice_search", "write_report": "write_report",
@@ -78,6 +78,7 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
+@taking_run_options
 def run(
     pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
     *,
@@ -98,7 +99,8 @@ def run(
     store
         Path or URL of the store (default: ``runs/NAME.zarr`` with the pipeline's name).
     workers
-        Processes of the cluster that is started for the run (default: the available processors).
+        Processes of this machine (default: the available processors, or one where little work is
+        expected).
     client
         A ``distributed.Client``, or a cluster object such as ``LocalCluster`` or ``SLURMCluster``,
         to run on instead. It stays open. Its workers must be processes that have the same versions
@@ -186,6 +188,7 @@ def open(store: str | os.PathLike[str]) -> xr.Dataset:  # noqa: A001  (as xarray
     return library.lifecycle.open_dataset(store)
 
 
+@taking_run_options
 def photos(
     *folders: str | os.PathLike[str],
     camera: str | os.PathLike[str] | None = None,
@@ -239,11 +242,12 @@ def photos(
     """
     prepared = library.prepare.prepare(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, store=store,
-        overwrite=options.get("overwrite", False))
+        overwrite=options["overwrite"])
     notice(*prepared.lines)
     return run(prepared.pipeline, store=prepared.store, **options)
 
 
+@taking_run_options
 def twins(
     photographs: str | os.PathLike[str],
     scene: Mapping[str, Any] | str | os.PathLike[str],
@@ -294,6 +298,7 @@ def twins(
         store=store or library.prepare.twin_store(photographs, named), **options)
 
 
+@taking_run_options
 def compare(
     first: str | os.PathLike[str],
     second: str | os.PathLike[str],

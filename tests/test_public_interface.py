@@ -19,7 +19,7 @@ from support.here import calls_here
 from sweep import library
 from sweep.errors import ArgumentError, SweepError
 from sweep.execution import runner
-from sweep.execution.progress import progress_report
+from sweep.execution.progress import DEFAULTS, progress_report
 
 FEW = {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 3}}
 
@@ -60,10 +60,7 @@ def test_every_public_function_says_what_it_takes_returns_and_raises(name):
     parameters = described.partition("Parameters\n---")[2].partition("Returns\n---")[0]
     named = re.findall(r"^(\w+(?:, \w+)*)$", parameters, re.MULTILINE)
     taken = inspect.signature(FUNCTIONS[name]).parameters
-    several = re.fullmatch(r"Unpack\[(\w+)\]", str(taken["options"].annotation)) if (
-        "options" in taken) else None
-    options = getattr(runner, several[1]).__annotations__ if several else {}
-    assert sorted(", ".join(named).split(", ")) == sorted({*taken, *options} - {"options"})
+    assert sorted(", ".join(named).split(", ")) == sorted(taken)
 
 
 @pytest.mark.system
@@ -129,6 +126,18 @@ def test_answers_refuse_other_types_by_name(function, arguments, expected):
         function(**arguments)
     with pytest.raises(ArgumentError, match=re.escape("names = []: expected camera")):
         sweep.reference([])
+
+
+@pytest.mark.parametrize(
+    "name", ["run", "photos", "twins", "compare", "limit", "size", "execute"])
+def test_options_of_a_run_are_in_signatures_and_misspelled_ones_are_refused(name, tmp_path):
+    function = getattr(sweep, name, runner.execute)
+    shown = {each.name: each.default for each in inspect.signature(function).parameters.values()}
+    assert shown | DEFAULTS == shown
+    with pytest.raises(ArgumentError) as raised:
+        function(tmp_path / "no.zarr", tmp_path / "no.zarr", worker=3)
+    assert re.fullmatch(r"worker = 3: unknown; expected one of .*; did you mean workers\?",
+                        str(raised.value))
 
 
 def test_every_module_that_mypy_sees_in_the_library_is_imported_on_use():

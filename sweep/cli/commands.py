@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import resource
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,8 +15,8 @@ import sweep
 from sweep import library
 from sweep.cli import command as cli
 from sweep.cli.command import Names, Numbers
-from sweep.errors import ArgumentError
-from sweep.isolation.child_process import Child
+from sweep.errors import ArgumentError, check_positive
+from sweep.isolation.child_process import Child, default_workers
 from sweep.messages import byte_count, duration, plain, quoted
 
 if TYPE_CHECKING:
@@ -134,7 +135,7 @@ def plan(
     read = cli.read_pipeline(pipeline, settings, precision, max_trials)
     library.runner.announce_compilation(read)
     facts, listed = read.facts, read.facts.parts
-    expected = library.forecast.forecast(read, workers)
+    expected = forecast(read, workers)
     bound = library.block.bound_notes(read)
     sections = {
         "Camera": [facts.camera_line, *facts.camera_notes],
@@ -160,6 +161,52 @@ def plan(
         **vars(expected),
         "parts": [dataclasses.asdict(part) for part in listed],
     }, 0, quoted("sweep", "run", pipeline, *words))
+
+
+def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
+    """Return the expected cost of a run into its own store; nothing is written.
+
+    A seeded sample of scenes is measured in a child process, for a few seconds at most,
+    compilation not counted.
+
+    Returns
+    -------
+    ``poses`` and ``results``: cells of the scene axes, and estimates; ``block`` and ``blocks``:
+    scenes of a block along each scene axis, and their number; ``worker_bytes`` of a worker's
+    memory; ``pose_s``: mean seconds a pose, all configurations included, of so many ``sampled``
+    ones, and whether the measurement was abandoned since a pose takes ``over`` that; ``workers``
+    (default: as a run has them); ``least_share`` of the poses that is computed in any case: of a
+    run in waves the first wave. ``files``, ``bytes``, ``seconds`` and ``objections`` as
+    `sweep.execution.forecast.forecast_of`. All else is that of all poses: how many a run in waves
+    needs, nobody knows.
+
+    Raises
+    ------
+    ArgumentError
+        If there are no workers.
+    """
+    check_positive("workers", workers, "expected at least 1", whole=True)
+    costs = library.forecast
+    with Child() as child:
+        timing = costs.measure(child, pipeline)
+    count = costs.process_count(pipeline, timing, workers)
+    blocks = costs.blocks_of(pipeline, timing.pose_s, count)
+    expected = costs.forecast_of(
+        f"runs/{pipeline.name}.zarr", pipeline, timing, blocks, min(count, default_workers()))
+    # Of a child that ended, the memory was at most this.
+    process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    stages = library.parameters.Stage
+    return SimpleNamespace(
+        poses=pipeline.size(stages.scene),
+        results=pipeline.size(*stages),
+        block=blocks.extents,
+        blocks=len(blocks),
+        **timing._asdict(),
+        **vars(expected),
+        worker_bytes=process + 3 * pipeline.experiment.bytes_of(math.prod(blocks.extents)),
+        workers=count,
+        least_share=costs.least_share(library.rules.make_rule(pipeline)),
+    )
 
 
 def _dimensions(pipeline: Pipeline) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import resource
 import shutil
 import time
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.errors import MachineFaultError, check_positive
+from sweep.errors import MachineFaultError
 from sweep.evaluation.block import run_cells
 from sweep.execution import TIME_LIMIT_S
 from sweep.experiment.grid import TRIAL, Axis, Blocks
@@ -121,9 +120,14 @@ def measure(child: Child, pipeline: Pipeline) -> Timing:
 SMALL_RUN_S = 3.0
 
 
-def process_count(pipeline: Pipeline, timing: Timing, workers: int | None) -> int:
-    """Return how many processes of this machine compute a run: as asked, else by its work."""
-    small = timing.sampled and pipeline.size(Stage.scene) * timing.pose_s < SMALL_RUN_S
+def process_count(
+    pipeline: Pipeline, timing: Timing, workers: int | None, left: float = 1.0
+) -> int:
+    """Return how many processes of this machine compute a run: as asked, else by its work.
+
+    ``left``: the share of the work that has not been done.
+    """
+    small = timing.sampled and left * pipeline.size(Stage.scene) * timing.pose_s < SMALL_RUN_S
     return workers or (1 if small else default_workers())
 
 
@@ -253,56 +257,21 @@ START_S = 1.5
 MAX_S = 86_400.0
 
 
-def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
-    """Return the expected cost of a run into its own store, as :func:`forecast_of` does.
-
-    A seeded sample of scenes is measured in a child process, for a few seconds at most,
-    compilation not counted; nothing is written.
-
-    Parameters
-    ----------
-    pipeline
-        Measured on its own grid.
-    workers
-        Number of workers (default: the available processors).
-
-    Raises
-    ------
-    ArgumentError
-        If there are no workers.
-    """
-    check_positive("workers", workers, "expected at least 1", whole=True)
-    with Child() as child:
-        timing = measure(child, pipeline)
-    count = process_count(pipeline, timing, workers)
-    blocks = blocks_of(pipeline, timing.pose_s, count)
-    expected = forecast_of(
-        f"runs/{pipeline.name}.zarr", pipeline, timing, blocks, min(count, default_workers()))
-    expected.workers = count
-    return expected
-
-
 def forecast_of(
     url: str, pipeline: Pipeline, timing: Timing, blocks: Blocks, workers: int,
     left: int | None = None,
 ) -> SimpleNamespace:
-    """Return the expected cost of a run; of its time, files and bytes for ``left`` of its blocks.
+    """Return the expected cost of a run of ``left`` of its blocks, in waves if all have to be run.
 
     Returns
     -------
-    ``poses`` and ``results``: cells of the scene axes, and estimates; ``block`` and ``blocks``:
-    scenes of a block along each scene axis, and their number; ``files`` and ``bytes`` (before
-    compression) that the run writes, and ``worker_bytes`` of a worker's memory; ``pose_s``: mean
-    seconds a pose, all configurations included, of so many ``sampled`` ones, and whether the
-    measurement was abandoned since a pose takes ``over`` that; ``workers``, and the ``seconds``
-    that they take; ``least_share`` of the poses that is computed in any case: of a run in waves the
-    first wave. All else is that of all poses: how many a run in waves needs, nobody knows.
-    ``objections``: why the run has to be confirmed; none if it need not be.
+    ``files`` and ``bytes`` (before compression) that the run writes, the ``seconds`` that it takes,
+    and ``objections``: why it has to be confirmed; none if it need not be.
     """
-    poses, left = pipeline.size(Stage.scene), len(blocks) if left is None else left
-    left_poses = math.ceil(poses * left / max(len(blocks), 1))
-    size = pipeline.experiment.bytes_of(left_poses)
-    seconds = START_S + left_poses * timing.pose_s / min(workers, max(len(blocks), 1))
+    left = len(blocks) if left is None else left
+    poses = math.ceil(pipeline.size(Stage.scene) * left / max(len(blocks), 1))
+    size = pipeline.experiment.bytes_of(poses)
+    seconds = START_S + poses * timing.pose_s / min(workers, max(left, 1))
     objections, free = [], free_bytes(url)
     if seconds > MAX_S:
         about = "about" if pipeline.stopping is None else "up to"
@@ -311,22 +280,8 @@ def forecast_of(
     if size > free:
         objections.append(f"writes {byte_count(size)} before compression, and "
                           f"{byte_count(int(free))} are free")
-    # Of a child that ended, the memory was at most this.
-    process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
-    return SimpleNamespace(
-        poses=poses,
-        results=pipeline.size(*Stage),
-        block=blocks.extents,
-        blocks=len(blocks),
-        files=left * (len(pipeline.experiment.variables) + 1),  # and a receipt
-        bytes=size,
-        worker_bytes=process + 3 * pipeline.experiment.bytes_of(math.prod(blocks.extents)),
-        **timing._asdict(),
-        workers=workers,
-        seconds=seconds,
-        least_share=least_share(make_rule(pipeline)),
-        objections=objections,
-    )
+    files = left * (len(pipeline.experiment.variables) + 1)  # and a receipt
+    return SimpleNamespace(files=files, bytes=size, seconds=seconds, objections=objections)
 
 
 def free_bytes(url: str) -> float:

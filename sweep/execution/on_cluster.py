@@ -11,11 +11,12 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, cast
 from urllib.parse import urlsplit
 
 from distributed import Client, KilledWorker, LocalCluster, Security, get_worker, wait
 from distributed.core import rpc
+from distributed.deploy.cluster import Cluster
 
 from sweep.errors import ArgumentError, RunError, StoreReplacedError
 from sweep.evaluation.results import differing_processors, processor
@@ -41,15 +42,6 @@ ANSWER_S = 10.0
 #: How long a run waits for a first worker, for all workers' versions, for which they import this
 #: package, and after the last worker left.
 WORKERS_S = 60.0
-
-
-@runtime_checkable
-class Cluster(Protocol):
-    """A cluster object: LocalCluster, SLURMCluster, KubeCluster, ..."""
-
-    @property
-    def scheduler_address(self) -> str:
-        """The address of its scheduler."""
 
 
 @contextlib.contextmanager

@@ -1,16 +1,23 @@
-"""Progress of a run while it runs, and its display on stderr."""
+"""What the caller of a run says and hears: the run's options, and its progress on stderr."""
 
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
+import os
 import sys
 import time
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from functools import wraps
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, TypeVar, cast
 
 from sweep.errors import ArgumentError
-from sweep.messages import notice
+from sweep.messages import nearest, notice, plain
+
+if TYPE_CHECKING:
+    from distributed import Client
+    from distributed.deploy.cluster import Cluster
 
 # --------------------------------------------------------------------------------------------------
 # How far a run is, while it runs: the event after each block, and its display on stderr.
@@ -125,3 +132,53 @@ def _display(every_s: float, *, ends: bool) -> Iterator[StageReport]:
     with rich.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None)
         yield lambda what, share: bar.update(task, description=what, completed=share, total=1.0)
+
+
+# --------------------------------------------------------------------------------------------------
+# The options of a run, declared once for all functions that run a pipeline.
+
+class RunOptions(TypedDict, total=False):
+    """Options of a run that are not its pipeline and store; `sweep.run` says what they mean."""
+
+    workers: int | None
+    client: Client | Cluster | None
+    scheduler: str | None
+    reuse: Sequence[str | os.PathLike[str]]
+    overwrite: bool
+    retry_failed: bool
+    yes: bool
+    progress: bool | ProgressReport | None
+    time_limit_s: float | None
+
+
+#: The value of each option that is not given.
+DEFAULTS: RunOptions = {
+    "workers": None, "client": None, "scheduler": None, "reuse": (), "overwrite": False,
+    "retry_failed": False, "yes": False, "progress": None, "time_limit_s": None}
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def taking_run_options(function: Function) -> Function:
+    """Show the options of a run in the signature of a function whose last parameter they are.
+
+    Completion and help read the signature. The function is called with all options, and raises
+    ArgumentError for a keyword that it does not take, before it does anything.
+    """
+    own = inspect.signature(function)
+    options = (
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default,
+                          annotation=RunOptions.__annotations__[name].__forward_arg__)
+        for name, default in DEFAULTS.items())
+    known = own.replace(parameters=[*[*own.parameters.values()][:-1], *options])
+
+    @wraps(function)
+    def checked(*given: Any, **keywords: Any) -> Any:
+        for name in keywords.keys() - known.parameters.keys():
+            raise ArgumentError(
+                name, plain(keywords[name], 60), "unknown; expected one of "
+                f"{', '.join(known.parameters)}{nearest(name, known.parameters)}")
+        return function(*given, **DEFAULTS | keywords)
+
+    vars(checked)["__signature__"] = known
+    return cast("Function", checked)

@@ -10,13 +10,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 from sweep import compilation, errors
 from sweep.evaluation.block import try_plugins
-from sweep.execution import forecast, status
+from sweep.execution import forecast, progress, status
 from sweep.execution.executors import Children, Executor, Failed
-from sweep.execution.progress import Progress, ProgressReport, progress_report
 from sweep.execution.waves import InWaves
 from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
@@ -33,9 +32,7 @@ from sweep.store.provenance import differences, match
 
 if TYPE_CHECKING:
     import xarray as xr
-    from distributed import Client
 
-    from sweep.execution.on_cluster import Cluster
 
 
 # --------------------------------------------------------------------------------------------------
@@ -59,20 +56,13 @@ def announce_compilation(pipeline: Pipeline) -> None:
         notice(f"compiling, once for this version: about {seconds} s")
 
 
+@progress.taking_run_options
 def execute(
     pipeline: Pipeline,
     store: str | os.PathLike[str] | None = None,
     *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    client: Client | Cluster | None = None,
-    reuse: Sequence[str | os.PathLike[str]] = (),
-    overwrite: bool = False,
-    retry_failed: bool = False,
-    yes: bool = False,
-    time_limit_s: float | None = None,
-    progress: bool | ProgressReport | None = None,
     child: Child | None = None,
+    **options: Unpack[progress.RunOptions],
 ) -> SimpleNamespace:
     """Run a pipeline into a store; blocks that are committed there are not computed again.
 
@@ -82,32 +72,12 @@ def execute(
         What to compute.
     store
         Path or URL of the store (default: ``runs/NAME.zarr``).
-    workers
-        Processes on this machine (default: the available processors, or a single one where less
-        than :data:`sweep.execution.forecast.SMALL_RUN_S` seconds of work are predicted).
-    scheduler
-        Address of a running Dask scheduler, whose workers compute instead: they must reach the
-        store under the same path. Or ``local``: a Dask cluster on this machine, for this run.
-    client
-        A ``distributed.Client`` or cluster object, whose workers compute instead; a client stays
-        open.
-    reuse
-        Stores whose finished cells are reused where their parameters agree.
-    overwrite
-        Delete an existing store.
-    retry_failed
-        Compute the blocks again in which cells failed or crashed, also of a finished store.
-    yes
-        Run also what would take more than a day, or more than is free on the disk.
-    time_limit_s
-        Block timeout in seconds; the search for a scene that never returns keeps within it
-        (default: 600, or ten times a block's work if that is more).
-    progress
-        True for a display on stderr, or what is called before the first block and after each one;
-        a line says that code is compiled.
     child
         The process that measures scenes and computes small runs, if the caller started it earlier
         (`Child()`), so that it has imported its packages by now.
+    options
+        As `sweep.run` explains them; without ``workers``, a single process computes where
+        less than :data:`sweep.execution.forecast.SMALL_RUN_S` seconds of work are predicted.
 
     Raises
     ------
@@ -120,6 +90,10 @@ def execute(
     """
     started = time.perf_counter()
     make_rule(pipeline)  # it refuses names that it does not know
+    workers, time_limit_s = options["workers"], options["time_limit_s"]
+    scheduler, client = options["scheduler"], options["client"]
+    reuse, overwrite, retry_failed = (
+        options["reuse"], options["overwrite"], options["retry_failed"])
     errors.check_positive("workers", workers, "expected at least 1", whole=True)
     if scheduler is not None and client is not None:
         raise errors.ArgumentError("scheduler", scheduler, "expected no client beside it")
@@ -128,26 +102,27 @@ def execute(
     if retry_failed and reuse:
         raise errors.ArgumentError(
             "reuse", errors.path_of("reuse", reuse[0]), "expected no retry_failed beside it")
-    display = progress_report(progress)
-    if progress:
+    display = progress.progress_report(options["progress"])
+    if options["progress"]:
         announce_compilation(pipeline)
     url = errors.path_of("store", store) if store is not None else f"runs/{pipeline.name}.zarr"
     begun = _store_to_continue(url, pipeline, overwrite)
-    again = status.failed_blocks(begun, blocks.committed(begun)) if begun and retry_failed else {}
+    done = set() if begun is None else blocks.committed(begun)
+    again = status.failed_blocks(begun, done) if begun and retry_failed else {}
     stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
     if begun is not None and begun.finished and not (again or stricter):
         blocks.check_whole(begun)
         return status.summary_of(begun, {}, time.perf_counter() - started, {})
+    done -= again.keys()
     notice(*pipeline.facts.notes)
     sources = _matching_sources(url, pipeline, reuse)
-    done = set() if begun is None else blocks.committed(begun) - again.keys()
     if begun is None:
         check_writable(url)
     elif is_written(begun.storage):
         notice(f"{url}: another process is writing it, too: each of the two may compute a block")
 
     with contextlib.ExitStack() as stack:
-        progress = stack.enter_context(display)
+        listener = stack.enter_context(display)
         child = stack.enter_context(child or Child())
         check_plugins(child, pipeline)
         timing = forecast.measure(child, pipeline)
@@ -158,13 +133,15 @@ def execute(
 
             executor = stack.enter_context(connected(pipeline, scheduler, client, workers))
         else:
+            # Of a run in waves, blocks that are committed may be computed again.
+            left = 1.0 if begun is None or pipeline.stopping else 1 - len(done) / len(begun.blocks)
             executor = stack.enter_context(Children(
-                child, forecast.process_count(pipeline, timing, workers)))
+                child, forecast.process_count(pipeline, timing, workers, left)))
         cut = begun.blocks if begun is not None else forecast.blocks_of(
             pipeline, timing.pose_s, executor.threads, time_limit_s)
         expected = forecast.forecast_of(
             url, pipeline, timing, cut, executor.threads, len(cut) - len(done))
-        if expected.objections and not (yes or sources):
+        if expected.objections and not (options["yes"] or sources):
             raise errors.StoreError(
                 f"{url}: the run {' and '.join(expected.objections)}; make it smaller, or confirm "
                 "it with `--yes` (in Python, yes=True)")
@@ -176,7 +153,7 @@ def execute(
             begun = lifecycle.reopen(begun, pipeline if stricter else None, again)
         limit_s = forecast.block_time_limit_s(time_limit_s, timing.pose_s * len(begun.blocks[0]))
         try:
-            computed = compute(begun, executor, sources, limit_s, interrupts, progress)
+            computed = compute(begun, executor, sources, limit_s, interrupts, listener)
         except (errors.RunError, errors.StoreError) as error:
             first, *others = str(error).splitlines()
             if not isinstance(error, errors.StoreReplacedError):
@@ -252,7 +229,7 @@ MAX_FAILED_BLOCKS = 10
 
 def compute(
     store: RunStore, executor: Executor, sources: Sequence[str], time_limit_s: float,
-    interrupts: Interrupts, progress: ProgressReport | None = None,
+    interrupts: Interrupts, listener: progress.ProgressReport | None = None,
 ) -> Mapping[str, int]:
     """Compute the blocks that are not committed, and close the store.
 
@@ -273,8 +250,8 @@ def compute(
     computed: Counter[str] = Counter()
 
     def report() -> None:
-        if progress is not None:
-            progress(Progress(
+        if listener is not None:
+            listener(progress.Progress(
                 totals.scenes, pipeline.size(Stage.scene),
                 totals.detection["detected"], *(() if waves is None else (
                     totals.needed, waves.settled, waves.conditions))))
@@ -339,20 +316,7 @@ def compute(
 MAX_TRIALS = 2400
 
 
-class RunOptions(TypedDict, total=False):
-    """Options of a run that are not its pipeline and store; `sweep.run` says what they mean."""
-
-    workers: int | None
-    client: Client | Cluster | None
-    scheduler: str | None
-    reuse: Sequence[str | os.PathLike[str]]
-    overwrite: bool
-    retry_failed: bool
-    yes: bool
-    time_limit_s: float | None
-    progress: bool | ProgressReport | None
-
-
+@progress.taking_run_options
 def limit(
     pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
     *,
@@ -363,7 +327,7 @@ def limit(
     max_trials: int | None = None,
     settings: Sequence[str] = (),
     store: str | os.PathLike[str] | None = None,
-    **options: Unpack[RunOptions],
+    **options: Unpack[progress.RunOptions],
 ) -> xr.Dataset:
     """Find how far along an axis requirements are met, and return the limits.
 
@@ -422,9 +386,9 @@ def limit(
         stopped, trials = stored.pipeline.stopping is not None, stored.pipeline.axis(TRIAL)
         if trials is not None and not (stopped or settings or max_trials):
             lifecycle.open_finished(stored.url)
-            results = lifecycle.open_dataset(os.fspath(pipeline))
-            limits = requirement_limits(results, require, along, per, at_all)
-            return limits.assign_attrs(store=os.fspath(pipeline))
+            limits = requirement_limits(
+                lifecycle.open_dataset(stored.url), require, along, per, at_all)
+            return limits.assign_attrs(store=stored.url)
         if store is None and stopped and not settings:
             store = pipeline
     try:
@@ -440,8 +404,7 @@ def limit(
                  if axis.is_numeric and axis.name != TRIAL]
         raise errors.ArgumentError(
             "along", along, f"expected one of {', '.join(names) or 'its axes'}")
-    own = f"runs/{read.name}-limit-{searched}.zarr"
-    summary = execute(read, own if store is None else store, **options)
+    summary = execute(read, store or f"runs/{read.name}-limit-{searched}.zarr", **options)
     notice(*summary.warnings)
     limits = requirement_limits(lifecycle.open_dataset(summary.store))
     return limits.assign_attrs(store=summary.store)

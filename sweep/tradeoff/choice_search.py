@@ -16,8 +16,8 @@ import numpy as np
 from sweep.analysis.dataset import DRAWS, computed_scenes
 from sweep.analysis.requirements import Answer, Decision, answers
 from sweep.errors import check_positive
-from sweep.execution.progress import StageReport, stage_display
-from sweep.execution.runner import RunOptions, execute
+from sweep.execution.progress import RunOptions, StageReport, stage_display, taking_run_options
+from sweep.execution.runner import execute
 from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -207,6 +207,7 @@ class Choice:
         return self.budget_ms is None or (cost is not None and cost.high <= self.budget_ms)
 
 
+@taking_run_options
 def size(
     pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
     *,
@@ -257,7 +258,7 @@ def size(
     found = tuple(answers(results, rule, choice_shares(read, rule)))
     costs: Sequence[Cost | None] = [None] * len(found)
     if len(found) > 1 or read.budget_ms is not None:
-        with stage_display() if options.get("progress") else contextlib.nullcontext() as stage:
+        with stage_display() if options["progress"] else contextlib.nullcontext() as stage:
             costs = choice_costs(read, rule, found, limit_s, stage or (lambda _what, _share: None))
     trials = computed_scenes(results).sum(DRAWS).compute()
     notice(*summary.warnings)

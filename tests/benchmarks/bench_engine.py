@@ -17,8 +17,9 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 
 from benchmarks.tables import header, row
+from sweep.cli.commands import forecast
 from sweep.evaluation.block import run_cells
-from sweep.execution.forecast import forecast, seconds_of
+from sweep.execution.forecast import seconds_of
 from sweep.execution.runner import execute
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline

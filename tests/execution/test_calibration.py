@@ -26,6 +26,7 @@ from sweep.execution.forecast import (
     blocks_of,
     forecast_of,
     measure,
+    process_count,
 )
 from sweep.experiment.grid import Blocks
 from sweep.experiment.parameters import Stage
@@ -45,6 +46,13 @@ def test_scenes_that_take_too_long_or_crash_are_taken_for_slow_ones(error, timin
     assert measure(child, PIPELINE) == timing
     blocks = blocks_of(PIPELINE, timing.pose_s, 2)
     assert math.prod(blocks.extents) <= max(BLOCK_S / timing.pose_s, 1)
+
+
+def test_processes_are_counted_by_the_work_that_is_left():
+    timing = Timing(0.1, 50)  # 5 s in all
+    assert process_count(PIPELINE, timing, None) == len(os.sched_getaffinity(0))
+    assert process_count(PIPELINE, timing, None, 0.5) == 1
+    assert process_count(PIPELINE, timing, 3, 0.5) == 3
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import pytest
 
 from support.clusters import Cluster
 from support.here import Here
+from sweep.execution import forecast
 from sweep.execution.forecast import (
     BLOCK_S,
     BLOCKS_PER_S,
@@ -49,7 +50,7 @@ def test_scenes_that_take_too_long_or_crash_are_taken_for_slow_ones(error, timin
 
 
 def test_processes_are_counted_by_the_work_that_is_left():
-    timing = Timing(0.1, 50)  # 5 s in all
+    timing = Timing(1.5 * forecast.SMALL_RUN_S / PIPELINE.size(Stage.scene), 50)
     assert process_count(PIPELINE, timing, None) == len(os.sched_getaffinity(0))
     assert process_count(PIPELINE, timing, None, 0.5) == 1
     assert process_count(PIPELINE, timing, 3, 0.5) == 3

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sweep.plugins import loading
     from sweep.report import figure, findings, output_file, report_data, scenes, table
     from sweep.sampling import rules
-    from sweep.store import lifecycle, locations
+    from sweep.store import blocks, lifecycle, locations
 
 if not TYPE_CHECKING:  # so that mypy knows the names above alone
 

@@ -439,8 +439,9 @@ def status(store: str) -> Findings:
     lines = [f"{state.title}: {what}", *(f"  {name:11} {text}" for name, text in rows.items())]
     for kind, cells in (("crashed", state.crashed), ("failed", state.failed)):
         lines += cli.listed(
-            [f"  {kind:11} --at {quoted(cell.at)}  {cell.stage}: {plain(cell.reason, 300)}"
-             for cell in cells], f"  {kind:11} and more; --json lists the first 1,000")
+            [f"  {kind:11} --at {quoted(cell['at'])}  {cell['stage']}: "
+             f"{plain(library.blocks.reason_of(cell['text']), 300)}" for cell in cells],
+            f"  {kind:11} and more; --json lists the first 1,000")
     then = state.advice or f"sweep report {quoted(store)}"
     if not state.finished:
         then = f"sweep {'status' if state.being_written else 'run'} {quoted(store)}"

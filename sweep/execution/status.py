@@ -19,7 +19,7 @@ from sweep.experiment.pipeline import selection_text
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag
 from sweep.messages import plain, quoted
 from sweep.store import blocks
-from sweep.store.blocks import FailedCell, Receipt, RunStore
+from sweep.store.blocks import Receipt, RunStore
 from sweep.store.lifecycle import open_store, write_groups
 from sweep.store.lock import is_written
 
@@ -51,7 +51,8 @@ class Totals:
     detection: Counter[str] = field(default_factory=Counter)
     estimate: Counter[str] = field(default_factory=Counter)
     processors: Counter[str] = field(default_factory=Counter)
-    lost: dict[str, list[FailedCell]] = field(default_factory=lambda: {"crashed": [], "failed": []})
+    lost: dict[str, list[Mapping[str, str]]] = field(
+        default_factory=lambda: {"crashed": [], "failed": []})
 
     def add(self, receipt: Receipt) -> None:
         """Add the receipt of another block."""
@@ -62,10 +63,10 @@ class Totals:
         self.estimate.update(receipt.estimate)
         self._list(receipt.failures)
 
-    def _list(self, failures: Iterable[FailedCell]) -> None:
+    def _list(self, failures: Iterable[Mapping[str, str]]) -> None:
         for cell in failures:
-            if len(self.lost[cell.kind]) < MAX_ROWS:
-                self.lost[cell.kind].append(cell)
+            if len(self.lost[cell["kind"]]) < MAX_ROWS:
+                self.lost[cell["kind"]].append(cell)
 
     @staticmethod
     def of_finished(store: RunStore) -> Totals:
@@ -108,7 +109,7 @@ MAX_REASON = 200
 _VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d[\d_,]*(?:\.\d*)?(?:[eE][-+]?\d+)?")
 
 
-def failure_groups(cells: Iterable[FailedCell]) -> list[dict[str, Any]]:
+def failure_groups(cells: Iterable[Mapping[str, str]]) -> list[dict[str, Any]]:
     """Group failed cells by kind, stage, and message without its numbers; the largest first.
 
     Returns
@@ -120,15 +121,17 @@ def failure_groups(cells: Iterable[FailedCell]) -> list[dict[str, Any]]:
 
     Examples
     --------
-    >>> cells = [FailedCell(f"trial={n}", "failed", "scene", f"ValueError: {n} px") for n in (3, 8)]
+    >>> cells = [{"at": f"trial={n}", "kind": "failed", "stage": "scene",
+    ...           "text": f"ValueError: {n} px"} for n in (3, 8)]
     >>> [(group["reason"], group["count"], group["at"]) for group in failure_groups(cells)]
     [('ValueError: 3 px', 2, 'trial=3')]
     """
     groups: dict[tuple[str, str, str], dict[str, Any]] = {}
     for cell in cells:
-        group = groups.setdefault((cell.kind, cell.stage, _VARYING.sub("#", cell.reason)), {
-            "kind": cell.kind, "stage": cell.stage, "reason": plain(cell.reason, MAX_REASON),
-            "count": 0, "at": cell.at})
+        kind, stage, reason = cell["kind"], cell["stage"], blocks.reason_of(cell["text"])
+        group = groups.setdefault((kind, stage, _VARYING.sub("#", reason)), {
+            "kind": kind, "stage": stage, "reason": plain(reason, MAX_REASON), "count": 0,
+            "at": cell["at"]})
         group["count"] += 1
     return sorted(groups.values(), key=lambda group: -int(group["count"]))
 

@@ -144,37 +144,6 @@ def receipt_key(number: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class FailedCell:
-    """A scene, or a scene with a configuration, that raised or whose process died.
-
-    Attributes
-    ----------
-    at
-        Its coordinates, as ``sweep repro --at`` takes them.
-    kind
-        "failed" (it raised) or "crashed" (its process died).
-    stage
-        "scene", "detection" or "estimation".
-    text
-        The end of the traceback, or how the process died.
-    """
-
-    at: str
-    kind: str
-    stage: str
-    text: str
-
-    @property
-    def reason(self) -> str:
-        """The first line of the exception's message in a traceback; of other texts the last."""
-        lines = self.text.strip().splitlines()
-        frames = [number for number, line in enumerate(lines) if line.startswith('  File "')]
-        raised = (line for line in lines[frames[-1] + 1 :] if not line[:1].isspace()) \
-            if frames else iter(())
-        return next(raised, lines[-1] if lines else "")
-
-
-@dataclass(frozen=True, slots=True)
 class Receipt:
     """The receipt that commits a block.
 
@@ -194,7 +163,7 @@ class Receipt:
     seconds
         Stage -> seconds for each configuration; zeros where nothing was computed.
     failures
-        The cells that failed or crashed, as far as they are recorded.
+        The cells that failed or crashed, as far as they are recorded (:func:`recorded`).
     wall_s
         Seconds from the block's start to its receipt.
     written
@@ -215,7 +184,7 @@ class Receipt:
     detection: Mapping[str, int]
     estimate: Mapping[str, int]
     seconds: Mapping[str, Sequence[float]]
-    failures: Sequence[FailedCell]
+    failures: Sequence[Mapping[str, str]]
     wall_s: float = 0.0
     written: float = 0.0
     checksums: Mapping[str, int] = field(default_factory=dict)
@@ -246,9 +215,7 @@ class Receipt:
         if chunk is None:
             raise ValueError("missing")
         try:
-            content = json.loads(files.unpacked(chunk)[8:])
-            failures = [FailedCell(**failure) for failure in content["failures"]]
-            return cls(**content | {"failures": failures})
+            return cls(**json.loads(files.unpacked(chunk)[8:]))
         except (AttributeError, KeyError, TypeError, RuntimeError) as error:
             raise ValueError(f"no receipt: {error}") from None
 
@@ -262,16 +229,32 @@ MAX_CHARACTERS = 4000
 
 def recorded(
     pipeline: Pipeline, block: Block, failures: Sequence[Any]
-) -> tuple[FailedCell, ...]:
-    """Return the failures that a block's receipt keeps."""
-    kept: list[FailedCell] = []
+) -> list[dict[str, str]]:
+    """Return the failures that a block's receipt keeps.
+
+    Returns
+    -------
+    Of each its coordinates ``at``, as ``sweep repro --at`` takes them; its ``kind``, "failed" (it
+    raised) or "crashed" (its process died); its ``stage``, "scene", "detection" or "estimation";
+    the ``text``: the end of the traceback, or how the process died.
+    """
+    kept = []
     for kind in ("failed", "crashed"):
         some = (each for each in failures if each.crashed == (kind == "crashed"))
-        kept += (
-            FailedCell(selected(pipeline, block.cell(each.scene), each), kind, each.stage,
-                       each.text[-MAX_CHARACTERS:])
-            for each in itertools.islice(some, MAX_PER_BLOCK))
-    return tuple(kept)
+        kept += [{
+            "at": selected(pipeline, block.cell(each.scene), each), "kind": kind,
+            "stage": each.stage, "text": each.text[-MAX_CHARACTERS:],
+        } for each in itertools.islice(some, MAX_PER_BLOCK)]
+    return kept
+
+
+def reason_of(text: str) -> str:
+    """Return the first line of the exception's message in a traceback; of other texts the last."""
+    lines = text.strip().splitlines()
+    frames = [number for number, line in enumerate(lines) if line.startswith('  File "')]
+    raised = (line for line in lines[frames[-1] + 1 :] if not line[:1].isspace()) \
+        if frames else iter(())
+    return next(raised, lines[-1] if lines else "")
 
 
 def selected(pipeline: Pipeline, cell: Sequence[int], failure: Any) -> str:

@@ -34,7 +34,7 @@ from sweep.execution.status import (
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
 from sweep.isolation.child_process import Interrupts
-from sweep.store.blocks import FailedCell, begin_block, committed
+from sweep.store.blocks import begin_block, committed
 from sweep.store.lifecycle import create_store, open_store
 
 TRACEBACK = """Traceback (most recent call last):
@@ -53,7 +53,7 @@ def outcome(detection, estimate, cells):
 
 
 def lost_cell(message, at, kind="failed", stage="estimation"):
-    return FailedCell(at, kind, stage, TRACEBACK.format(message))
+    return {"at": at, "kind": kind, "stage": stage, "text": TRACEBACK.format(message)}
 
 
 def test_failures_are_grouped_by_exception_without_its_numbers_and_by_stage():
@@ -64,7 +64,8 @@ def test_failures_are_grouped_by_exception_without_its_numbers_and_by_stage():
     ]
     cells += [lost_cell("ValueError: other", "trial=20"), lost_cell("KeyError: 'a'", "trial=21")]
     cells += [lost_cell("ValueError: other", "trial=22", stage="detection")]
-    cells += [FailedCell("trial=23", "crashed", "scene", "ended by SIGSEGV")]
+    cells += [{
+        "at": "trial=23", "kind": "crashed", "stage": "scene", "text": "ended by SIGSEGV"}]
     found = [tuple(group[name] for name in ("count", "kind", "stage", "reason", "at"))
              for group in failure_groups(cells)]
     assert found == [

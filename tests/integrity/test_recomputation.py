@@ -100,9 +100,9 @@ def test_receipts_keep_a_bounded_number_of_rows_and_the_end_of_a_long_traceback(
     block = Block((0,), (6000,))
     kept = recorded(pipeline, block, failures)
     for first, kind in enumerate(("failed", "crashed")):
-        assert [one.at for one in kept if one.kind == kind] == [
+        assert [one["at"] for one in kept if one["kind"] == kind] == [
             f"trial={5000 + first + 2 * k}" for k in range(MAX_PER_BLOCK)]
-    assert all(one.text.endswith("last") and len(one.text) <= 4000 for one in kept)
+    assert all(one["text"].endswith("last") and len(one["text"]) <= 4000 for one in kept)
 
 
 TURN = Rotation.from_rotvec([0.3, -0.2, 0.1])

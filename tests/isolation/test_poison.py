@@ -88,12 +88,12 @@ def see_status(url, pipeline, poisons):
     """Assert that the status names every crashed scene so that other commands take it, and how."""
     names = {axis.name for axis in pipeline.experiment.scene_axes}
     deadly, crashed = [poison for poison in poisons if poison.deadly], status(url).crashed
-    told = {tuple(part for part in cell.at.split(",") if part.partition("=")[0] in names)
+    told = {tuple(part for part in cell["at"].split(",") if part.partition("=")[0] in names)
             for cell in crashed}
     assert told == {tuple(selection_text(pipeline, scene_index(pipeline, poison.cell)).split(","))
                     for poison in deadly}
     ways = {"segv": "SIGSEGV", "abort": "SIGABRT", "ill": "SIGILL", "hold": "time limit"}
-    assert all(any(ways.get(poison.how, "") in cell.reason for cell in crashed)
+    assert all(any(ways.get(poison.how, "") in cell["text"] for cell in crashed)
                for poison in deadly)
 
 

@@ -182,6 +182,7 @@ def test_poses_that_cannot_be_seen_are_no_condition():
     (["detection"], "expected NAME >= NUMBER"),
     (["detection >= 99 %"], "write 0.99"),
     (["detection >= 95"], "write 0.95 for 95 %"),
+    (["detection >= 120"], "above 0 and below 1$"),
     (["detection >= 1"], "expected a limit above 0 and below 1"),
     (["detection >= 0"], "expected a limit above 0 and below 1"),
     (["detektion >= 0.9"], "did you mean detection_rate?"),

@@ -168,11 +168,12 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
         found.cameras.optics(0), image, np.zeros(2, dtype=np.int64), toned=False,
     )
     turn, position = pose_of(CHARUCO, 5, pose)
-    work = system(*view.levels.shape)
-    draw(view, state_of(turn, position, 0.8, np.zeros(3)), work)
+    height, width = view.levels.shape
+    work, (beyond, _, _) = system(height, width), system(height + 1, width)
+    draw(view, state_of(turn, position, 0.8, np.zeros(3)), work._replace(rates=beyond[:-1]))
+    assert not beyond.any()  # nothing is written below the image
     shifts = found.cameras.view[0, 2:] - view.marker.optics.intrinsics[2:]
     left, top = np.rint(shifts).astype(int)
-    height, width = view.levels.shape
     used = np.zeros((height, width), dtype=bool)
     for row, (first, last) in zip(used, view.spans, strict=True):
         row[first:last] = True

@@ -18,7 +18,7 @@ from scipy import special
 from sweep.analysis import dataset, estimator
 from sweep.analysis.dataset import DRAWS, ERROR_INPUTS, QUANTITIES, Poses, Quantity, axes_of
 from sweep.analysis.estimator import INTERVAL, LEVEL, Bins, Columns, Count, Mean, Output, Statistic
-from sweep.analysis.summaries import DETECTION_RATE, FLIP_RATE
+from sweep.analysis.summaries import DETECTION_RATE
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED, Stage
 from sweep.experiment.schema import LABELS, cf_attributes
@@ -893,7 +893,7 @@ class SolvedQuantile(Statistic[Poses]):
 #: All, in the order of the table.
 GAP_STATISTICS: tuple[ComparedRate | SolvedQuantile, ...] = (
     *(ComparedRate(each.name, each.meaning, each.successes, each.used)
-      for each in (DETECTION_RATE, FLIP_RATE)),
+      for each in (DETECTION_RATE, estimator.FLIP_RATE)),
     SolvedQuantile("range_bias_percent", "median depth error of the true depth, solved",
                    lambda poses: poses.range_percent[..., 0], units="percent"),
     *(SolvedQuantile(

@@ -879,7 +879,9 @@ class StandardDeviation(RootMeanSquare[ViewT]):
 # have missed, and that no rotation error is larger than half a turn.
 
 #: The share of flips among the solved.
-FLIPS: Rate[Poses] = Rate("", "", lambda poses: poses.flipped, lambda poses: poses.solved)
+FLIP_RATE: Rate[Poses] = Rate(
+    "flip_rate", "nearer to the mirror of the truth, of solved", lambda poses: poses.flipped,
+    lambda poses: poses.solved, inputs=dataset.ESTIMATE_INPUTS)
 
 
 @dataclass(frozen=True)
@@ -914,7 +916,7 @@ class FlipMixture(Statistic[Poses]):
         lows = [np.nan_to_num(np.where(np.isnan(one), other, one), nan=0.0)
                 for one, other in ((u_low, v_low), (v_low, u_low))]
         highs = [np.fmin(high, self.bound**2) for high in (u_high, v_high)]
-        sample, hits, draws = FLIPS.worth(columns, design, LEVEL)
+        sample, hits, draws = FLIP_RATE.worth(columns, design, LEVEL)
         shares = outward(clopper_pearson, hits, sample.n, draws, level)
         low = np.minimum(*((1 - share) * lows[0] + share * lows[1] for share in shares))
         high = np.maximum(*((1 - share) * highs[0] + share * highs[1] for share in shares))
@@ -1102,8 +1104,12 @@ def read_bins(results: xr.Dataset, kept: Sequence[str], bins: Bins) -> Edges:
     return edges
 
 
-def in_bins(columns: Arrays, edges: Edges) -> Iterator[Arrays]:
-    """Yield the columns of each combination of bins: its cells, with the mask of those inside."""
+def in_bins(columns: Arrays, edges: Edges, design: Design) -> Iterator[Arrays]:
+    """Yield the columns of each combination of bins, with the mask of the poses inside.
+
+    Cells without a pose inside are left out, and trials: each cell has its own, those with a pose
+    inside first. Replicates count in any case, and photographs keep their places.
+    """
     if not edges:
         yield columns
         return
@@ -1113,8 +1119,13 @@ def in_bins(columns: Arrays, edges: Edges) -> Iterator[Arrays]:
     for index in np.ndindex(*(len(each) - 1 for each in edges.values())):
         inside = np.logical_and.reduce([a == b for a, b in zip(numbers, index, strict=True)])
         cells = inside.any(axis=(0, 2, 3))
+        seen = inside[:, cells].any(axis=3) | (design.unit != "trial")
+        draws = np.argsort(~seen, axis=2, kind="stable")[..., : seen.sum(axis=2).max(initial=1)]
         part = {**columns, INSIDE: inside}
-        yield part if cells.all() else {name: each[:, cells] for name, each in part.items()}
+        # In memory the draws stay side by side, as `_column` arranges them.
+        yield part if draws.size == inside[..., 0].size else {name: np.moveaxis(np.take_along_axis(
+            np.moveaxis(each[:, cells], 2, -1), np.expand_dims(draws, (*range(2, each.ndim - 1),)),
+            axis=-1), -1, 2) for name, each in part.items()}
 
 
 def bin_coordinates(results: xr.Dataset, edges: Edges) -> dict[str, Any]:
@@ -1171,7 +1182,7 @@ def aggregates(
     columns, design = arranged(results, {**inputs, **binned}, kept, stopped=stopped)
     statistics = [*itertools.chain(*sets)]
     found: list[list[NDArray[Any]]] = []  # (bins, outputs, groups, ...)
-    for part in in_bins(columns, edges):
+    for part in in_bins(columns, edges, design):
         groups, *rest = next(iter(part.values())).shape[:4]
         step = max(MAX_SHARED // max(math.prod(rest), 1), 1)  # groups at a time
         # One at a time: each keeps what it has computed of its poses.
@@ -1218,9 +1229,8 @@ def arranged(
     order = dataset.replicate_order(results, draws)
     unit: Unit = "replicate" if order is not None else (
         "photograph" if dataset.of_photographs(results) else "trial")
-    points = math.prod(sizes[name] for name in settings)
     return ({name: _column(array, axes, sizes, order) for name, array in inputs.items()},
-            Design(unit, points, stopped))
+            Design(unit, math.prod(sizes[name] for name in settings), stopped))
 
 
 def _column(
@@ -1242,10 +1252,9 @@ def _column(
         # Of Dask a part at a time: together they would be in memory twice. Few parts, for each
         # looks through the names of all chunks.
         ends = np.cumsum(array.chunks[0], dtype=int).tolist() if array.chunks else []
-        for start, end in itertools.pairwise([0, *ends[: -1 : len(ends) // 16 or 1], *ends[-1:]]):
-            target[start:end] = array[start:end].to_numpy()
-        if not ends:
-            target[...] = array.to_numpy()
+        ends = [0, *ends[: -1 : len(ends) // 16 or 1], *ends[-1:]]
+        for part in [*itertools.starmap(slice, itertools.pairwise(ends))] or (...,):
+            target[part] = array[part].to_numpy()
     except (RuntimeError, ValueError) as error:  # Zarr's, of a chunk that is damaged
         raise DatasetError(
             f"a store cannot be read: {error}; `sweep verify` names what is damaged") from None

@@ -16,7 +16,7 @@ from scipy import special, stats
 
 from sweep.analysis import dataset, estimator
 from sweep.analysis.dataset import DRAWS, QUANTITIES, Poses, Quantity, as_names, describes, stacked
-from sweep.analysis.estimator import INTERVAL, LEVEL, Bins, Count, Mean, Rate, Statistic
+from sweep.analysis.estimator import FLIP_RATE, INTERVAL, LEVEL, Bins, Count, Mean, Rate, Statistic
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import POSE_PARAMETERS, cf_attributes
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, flag, outcomes
@@ -35,9 +35,6 @@ DETECTION_RATE: Rate[Poses] = Rate(
 SOLVED_RATE: Rate[Poses] = Rate(
     "solved_rate", "solved of looked_for", lambda poses: poses.solved,
     lambda poses: poses.looked_for, inputs=dataset.ESTIMATE_INPUTS)
-FLIP_RATE: Rate[Poses] = Rate(
-    "flip_rate", "nearer to the mirror of the truth, of solved", lambda poses: poses.flipped,
-    lambda poses: poses.solved, inputs=dataset.ESTIMATE_INPUTS)
 
 
 @describes

@@ -816,8 +816,7 @@ def photos(
     count = prepared.pipeline.size(library.parameters.Stage.detection)
     each = f" with {count} detector settings" if count > 1 else ""
     return cli.summarised(
-        summary, f"{prepared.markers:,} markers in {prepared.photographs:,} photographs: "
-        f"{cli.detected_line(summary)}{each}", photographs=prepared.lines)
+        summary, f"{cli.detected_line(summary)}{each}", photographs=prepared.lines)
 
 
 @cli.command("your camera", "pipelines/photographs/README.md", {

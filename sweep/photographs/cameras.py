@@ -315,25 +315,28 @@ def check_resolution(
     found
         The board's corners in each photograph.
     rms_px
-        Their RMS in the median photograph with this camera; NaN if it is not known.
+        Their RMS in the median photograph with this camera; NaN if it is not known. Also refused
+        where a calibration's would be.
 
     Raises
     ------
     ArgumentError
         One line.
     """
-    if not rms_px >= DOUBTFUL_PX:
-        return
-    best = sorted(found, key=lambda each: -len(each.points))[:MAX_TRIED_VIEWS]
-    own = _median_rms(camera, best)
-    least, scale = min((_median_rms(scaled(camera, float(each)), best), each) for each in SCALES)
-    if least < CLEARLY_BETTER * own:
-        raise ArgumentError(
-            "camera", plain(written),
-            f"the board's corners are {own:.2g} px RMS beside it, and {least:.2g} px if its "
-            f"numbers are times {scale}: it is of another resolution; give the calibration of "
-            f"{size[0]} x {size[1]}",
-        )
+    fault = _rms_fault(rms_px, size)
+    if rms_px >= DOUBTFUL_PX:
+        best = sorted(found, key=lambda each: -len(each.points))[:MAX_TRIED_VIEWS]
+        own = _median_rms(camera, best)
+        least, scale = min(
+            (_median_rms(scaled(camera, float(each)), best), each) for each in SCALES)
+        if least < CLEARLY_BETTER * own:
+            fault = (
+                f"the board's corners are {own:.2g} px RMS beside it, and {least:.2g} px if its "
+                f"numbers are times {scale}: it is of another resolution; give the calibration of "
+                f"{size[0]} x {size[1]}"
+            )
+    if fault:
+        raise ArgumentError("camera", plain(written), fault)
 
 
 def scaled(camera: Calibration, scale: float) -> Calibration:
@@ -389,7 +392,7 @@ def calibrate(
     made = intrinsics.calibrate(
         [each.points for each in used], [each.pixels for each in used], size
     )
-    limit, fault = MAX_RMS_PX * max(1.0, size[0] / 800), ""
+    fault = _rms_fault(made.rms_px, size)
     if len(used) < MIN_PHOTOGRAPHS:
         fault = (
             f"expected {MIN_PHOTOGRAPHS} photographs with at least {MIN_CALIBRATING} corners of "
@@ -400,12 +403,6 @@ def calibrate(
         fault = (
             "OpenCV cannot calibrate from these photographs; take others, from different sides, or "
             "give the file of a calibration"
-        )
-    elif made.rms_px > limit:
-        fault = (
-            f"corners are {made.rms_px:.2g} px RMS beside the calibrated camera; expected at most "
-            f"{limit:.2g} px: check the board's kind, that the print is flat, and that all "
-            "photographs are of one camera at one focus"
         )
     if fault:
         raise ArgumentError("camera", "calibrate", fault)
@@ -422,6 +419,16 @@ def calibrate(
     )
     covariance = _covariance(camera, [used[i] for i in made.used], made)
     return replace(camera, covariance=tuple(covariance.ravel().tolist())), line
+
+
+def _rms_fault(rms_px: float, size: tuple[int, int]) -> str:
+    """Return the fault of a camera beside which a board's corners have that RMS, or none."""
+    limit = MAX_RMS_PX * max(1.0, size[0] / 800)
+    return "" if not rms_px > limit else (
+        f"corners are {rms_px:.2g} px RMS beside the camera; expected at most {limit:.2g} px: "
+        "check the board's kind, that the print is flat, and that all photographs are of this "
+        "camera at one focus"
+    )
 
 
 def _covariance(

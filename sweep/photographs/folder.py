@@ -76,18 +76,17 @@ def read_folder(home: Path, part: Part = Part.whole) -> Folder:
         raise fault_of(home, f"{error.strerror or 'unreadable'}{nearest_file(home)}") from None
     photographs: list[Photograph] = []
     left_out: dict[str, list[str]] = {}
-    names: dict[str, str] = {}
     notes: Counter[str] = Counter()
     for path in files:
         try:
             if path.suffix.lower() not in IMAGE_SUFFIXES or path.is_dir():
-                raise ValueError("no images")
+                raise ValueError("no PNG, JPEG, BMP or PGM images")
             if any("\ud800" <= character <= "\udfff" for character in path.name):
                 raise ValueError("its name is not UTF-8, as a store needs it")
             content, image = read_image(str(path)), decode_grey(str(path))
             digest = hashlib.sha256(content).hexdigest()
-            if names.setdefault(digest, path.name) != path.name:
-                raise ValueError(f"the same photographs again (= {plain(names[digest])})")
+            if any(each.digest == digest for each in photographs):
+                raise ValueError("the same photographs again")
         except ValueError as error:
             left_out.setdefault(str(error), []).append(path.name)
             continue
@@ -98,8 +97,7 @@ def read_folder(home: Path, part: Part = Part.whole) -> Folder:
     lines += [f"{name}: {count} of {len(photographs)} photographs {note}"
               for note, count in sorted(notes.items())]
     if not photographs:
-        kinds = ", ".join(each[1:].upper() for each in IMAGE_SUFFIXES)
-        raise fault_of(home, "; ".join([f"expected photographs ({kinds})", *lines]))
+        raise fault_of(home, "; ".join(["expected photographs (PNG, JPEG, BMP, PGM)", *lines]))
     ((height, width), _), *others = Counter(each.image.shape for each in photographs).most_common()
     if others:
         odd = [f"{path.name} ({image.shape[1]} x {image.shape[0]})"
@@ -310,17 +308,17 @@ def check_board(
     ArgumentError
         One line: the fault, and which board fits.
     """
-    folder, (height, width) = photographs[0].path.parent, photographs[0].image.shape
+    folder = photographs[0].path.parent
     ids = {each for one in seen for each in one.ids.tolist()}
     twice, once = sum(one.repeated for one in seen), sum(len(one.ids) for one in seen)
     odd = [
         photograph.path.name for photograph, one in zip(photographs, seen, strict=False)
         if len(one.ids) >= MIN_JUDGED and fitting_share(board, [one]) < MIN_OWN
     ]
-    if width >= 2 * height and twice + once >= MIN_JUDGED and twice > once:
+    if twice + once >= MIN_JUDGED and twice > once:
         raise fault_of(
-            folder, "most markers are in both halves of the images: of two cameras side by side "
-            "give the calibration (--stereo FILE)",
+            folder, "most markers are in an image twice: of two cameras side by side give the "
+            "calibration (--stereo FILE), of two equal boards show one",
         )
     if not ids:
         fault = _no_marker(board, find, photographs[:MAX_TRIED])
@@ -341,10 +339,12 @@ def check_board(
 
 def _no_marker(board: Board, find: FindFunction, tried: Sequence[Photograph]) -> str:
     """Return the fault of photographs without a marker of a board's dictionary."""
-    counts = {
-        name: sum(len(detect_markers(find, each.image, name).ids) for each in tried)
-        for name in opencv_dictionary_names()
-    }
+    def count(name: str, *axes: int) -> int:
+        images = (np.ascontiguousarray(np.flip(each.image, axes)) for each in tried)
+        return sum(len(detect_markers(find, image, name).ids) for image in images)
+
+    counts = {name: count(name) for name in opencv_dictionary_names()}
+    counts[f"{board.dictionary} in the mirror image"] = count(board.dictionary, 1)
     best = max(counts, key=lambda name: counts[name])
     return f"no photograph shows a marker of {board.dictionary}; " + (
         f"there are {counts[best]} of {best} in the first {len(tried)}" if counts[best] > 1
@@ -365,8 +365,9 @@ def _misfit(document: Mapping[str, Any], board: Board, seen: Sequence[SeenMarker
     # Another board fits better, if it can. Of those that fit as well, the first.
     share = fitting_share(board, seen)
     least = max(MIN_FITTING, share + CLEARLY)
+    first = min(each for one in seen for each in one.ids.tolist())
     shares = {f"{words} fits": fitting_share(other, seen)
-              for words, other in _others(document if least <= 1 else {})}
+              for words, other in _others(document if least <= 1 else {}, first)}
     remedy = max(shares, key=lambda words: shares[words], default="")
     if shares.get(remedy, 0.0) < least:
         if share >= MIN_FITTING:
@@ -427,8 +428,11 @@ COUNTS = {
 }
 
 
-def _others(document: Mapping[str, Any]) -> Iterator[tuple[str, Board]]:
-    """Yield boards that differ from a file's in an often mistaken key, each in words."""
+def _others(document: Mapping[str, Any], first: int) -> Iterator[tuple[str, Board]]:
+    """Yield boards that differ from a file's in an often mistaken key, each in words.
+
+    ``first`` is the least ID that is seen.
+    """
     kind = document.get("kind")
     if kind not in COUNTS:
         return
@@ -437,10 +441,12 @@ def _others(document: Mapping[str, Any]) -> Iterator[tuple[str, Board]]:
     sizes = dict.fromkeys([(width, height), (height, width), *itertools.product(
         (width, width - 1, width + 1), (height, height - 1, height + 1))])
     patterns = (legacy, not legacy) if kind == "charuco" else (legacy,)
-    for (columns, rows), pattern in itertools.product(sizes, patterns):
-        change = {key: value for key, value, own in (
-            (across, columns, width), (down, rows, height), ("legacy_pattern", pattern, legacy),
-        ) if value != own}
+    own = (width, height, legacy, document.get("first_id", 0))
+    firsts = dict.fromkeys((own[3], first))
+    for size, *others in itertools.product(sizes, patterns, firsts):
+        change = {key: value for key, value, before in zip(
+            (across, down, "legacy_pattern", "first_id"), (*size, *others), own, strict=True
+        ) if value != before}
         try:
             other = board_of({**document, **change}, "board")
         except SweepError:

@@ -53,16 +53,12 @@ class Prepared(NamedTuple):
         The experiment.
     lines
         Photographs found, left out and converted, a line each.
-    photographs, markers
-        How many there are: markers whose pose is known.
     store
         Path or URL of the store in which the results belong.
     """
 
     pipeline: Pipeline
     lines: tuple[str, ...]
-    photographs: int
-    markers: int
     store: str
 
 
@@ -212,14 +208,16 @@ def prepare(
         back = rig.rotation.T
         partner_poses(one, others[0], rig.rotation, rig.translation)
         partner_poses(others[0], one, back, -back @ rig.translation)
+        if sizes and any(not each.record.shown.any() or _misplaced(each) for each in sides):
+            raise ArgumentError("stereo", plain(stereo), (
+                "most markers are not where the other camera has them; expected R and T, in "
+                "metres, from the left camera's frame to the right one's"))
     sides = sides[:1] if one_camera else sides
     lines += _summary(sides, dictionary)
     name = name or name_of(Path(folders[0]))
     records = _write_records(sides, place, name, overwrite=overwrite)
     pipeline = _experiment(sides, records, dictionary, settings, place, name)
-    markers = sum(int(each.record.shown.sum()) for each in sides)
-    return Prepared(pipeline, tuple(lines), len(first.photographs), markers,
-                    os.fspath(store or place / f"{name}.zarr"))
+    return Prepared(pipeline, tuple(lines), os.fspath(store or place / f"{name}.zarr"))
 
 
 def record_home(store: PathName | None) -> tuple[str, str]:
@@ -327,7 +325,9 @@ def _summary(sides: Sequence[Side], dictionary: str) -> list[str]:
     with_pose = shown.any(axis=2)
     empty = [Path(records[k].paths[i]).name for k, i in np.argwhere(~with_pose).tolist()]
     count = int(with_pose.any(axis=0).sum())
-    lines = [f"no pose of a marker is known in {folder.named(empty)}: not counted"] if empty else []
+    share = shown.sum() / (shown.sum() + len(empty) * shown.shape[2])
+    lines = [(f"no pose of a marker is known in {folder.named(empty)}: not counted; were all "
+              f"markers in them and missed, rates would be times {share:.2f}")] if empty else []
     std, translation, sources = (
         np.array([getattr(each, name) for each in records])[shown]
         for name in ("std", "translation", "source")
@@ -340,7 +340,9 @@ def _summary(sides: Sequence[Side], dictionary: str) -> list[str]:
             f"{100 * np.nanmedian(std[:, 5] / translation[:, 2]):.2g} % of the range"
         )
     what = "photographs" if len(records) == 1 else "pairs of photographs"
-    return [*lines, f"{int(shown.sum()):,} markers in {count:,} {what}; truth: {source}{spread}"]
+    near, far = translation[:, 2].min(), translation[:, 2].max()
+    found = f"{int(shown.sum()):,} markers, {near:.3g} to {far:.3g} m away, in {count:,} {what}"
+    return [*lines, f"{found}; truth: {source}{spread}"]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -428,9 +430,6 @@ def _errors(
 #: Distance of a corner to where the detected marker has it, as a share of the marker's side.
 NEAR_SHARE = 0.5
 
-#: Ratio of distances from which positions are taken for those in another unit.
-OTHER_UNIT = 1.5
-
 
 def poses_of_file(side: Side, path: Path) -> list[str]:
     """Write a file's poses of markers wholly in their photographs; return lines on them.
@@ -457,11 +456,16 @@ def poses_of_file(side: Side, path: Path) -> list[str]:
     if not np.isfinite(answers.translation).all() or not np.isfinite(answers.rotation).all():
         faults.append("expected a pose in each row: rx, ry, rz, tx, ty, tz")
     if not faults:
-        own = side._replace(record=copy.deepcopy(record))
-        own_poses(own)
         side.put((answers.image, marker), answers.rotation, answers.translation,
                  TruthSource.poses_file)
-        faults += _faults(side, own)
+        ratio = _misplaced(side)
+        if ratio is not None:
+            faults.append(
+                "most markers are not where its poses have them, with positions that are "
+                f"{ratio:.3g} times those of the detected markers; expected metres, the marker's "
+                "true size, and rotation vectors and positions from the marker's frame (x right, "
+                "y up) to the camera's (x right, y down, z forward)"
+            )
     if faults:
         raise refusal([f"{plain(path)}: {fault}" for fault in faults])
     given = np.nonzero(record.shown)
@@ -471,25 +475,21 @@ def poses_of_file(side: Side, path: Path) -> list[str]:
     return [line] if cut.any() else []
 
 
-def _faults(side: Side, own: Side) -> list[str]:
-    """Return the fault of poses that are not where markers have their ``own``, if there is one."""
+def _misplaced(side: Side) -> float | None:
+    """Return the ratio of distances to those of markers' own poses, if most are elsewhere."""
+    own = side._replace(record=copy.deepcopy(side.record))
+    own.record.translation[:] = np.nan
+    own_poses(own)
     both = np.nonzero(side.record.shown & own.record.shown)
     seen = own.images(both)
     away = np.linalg.norm(side.images(both) - seen, axis=2).max(axis=1)
     shares = np.nan_to_num(away / side_lengths(seen).mean(axis=1), nan=np.inf)
     if not len(shares) or np.median(shares) < NEAR_SHARE:
-        return []
+        return None
     given, detected = (
         np.linalg.norm(each.record.translation[both], axis=1) for each in (side, own)
     )
-    ratio = float(np.median(given / detected))
-    return [(
-        "most markers are not where its poses have them; expected rotation vectors and positions "
-        "from the marker's frame (x right, y up) to the camera's (x right, y down, z forward)"
-    ) if 1 / OTHER_UNIT < ratio < OTHER_UNIT else (
-        f"its positions are {ratio:.3g} times those of the detected markers; expected metres, and "
-        "the marker's true size"
-    )]
+    return float(np.median(given / detected))
 
 
 # --------------------------------------------------------------------------------------------------

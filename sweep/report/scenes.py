@@ -254,7 +254,7 @@ def scenes_of(data: ReportData) -> list[Scene]:
 def _scene(data: ReportData, index: Index, titles: Sequence[str]) -> Scene:
     flags = data.results.isel(index)
     at = selection_text(data.pipeline, index)
-    command = quoted("sweep", "show", f"{data.pipeline.name}.toml", *(["--at", at] if at else []))
+    command = quoted("sweep", "show", data.store, *(["--at", at] if at else []))
     shown = Scene(titles, at.replace(",", ", "), command, "", None)
     if flags["detection"] == DetectionStatus.crashed or flags["estimate"] == EstimateStatus.crashed:
         return shown._replace(result="crashed: not drawn, its process died; `sweep repro` computes "

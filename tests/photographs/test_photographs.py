@@ -268,7 +268,7 @@ def test_the_covariance_of_a_calibration_has_opencvs_standard_deviations():
 def test_a_camera_that_does_not_fit_its_photographs_is_refused():
     rng = np.random.default_rng(1)
     turned = [seen(number, rng, 4.0) for number in range(len(POSES))]
-    with pytest.raises(ArgumentError, match="px RMS beside the calibrated camera; expected at mo"):
+    with pytest.raises(ArgumentError, match="px RMS beside the camera; expected at most"):
         calibrate(SIZE, turned)
 
 

@@ -428,16 +428,23 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
     A copy that was made while the store was written has such blocks, for instance.
     """
     missing: dict[int, str] = {}
-    indices = {number: store.blocks.index(number) for number in numbers}
+    whole: dict[str, list[str]] = {}
+    some = list(numbers)
+    # All indices at once; one more than there are axes, for a store of one block without any.
+    indices = np.unravel_index(np.array(some, np.intp), (*store.blocks.counts, 1))
 
     @functools.cache  # many variables have chunks of the same names
     def numbered(template: str) -> dict[str, int]:
-        return {template.format(*index): number for number, index in indices.items()}
+        names = map(template.format, *(index.tolist() for index in indices))
+        return dict(zip(names, some, strict=True))
 
-    for variable, (template, _) in store.chunks.items() if indices else ():
-        names = numbered(template)
-        absent = {f"{variable}/{name}": names[name]
-                  for name in names.keys() - files.list_folder(store.storage, variable)}
+    for variable, (template, _) in store.chunks.items() if some else ():
+        names, listed = numbered(template), files.list_folder(store.storage, variable)
+        if listed == whole.get(template):  # many file systems list the same names in one order
+            continue
+        absent = {f"{variable}/{name}": names[name] for name in names.keys() - listed}
+        if not absent:
+            whole[template] = listed
         # A listing may be older than a file, as over NFS: what it lacks is looked for.
         found = zip(absent.items(), files.read_files(store.storage, [*absent]), strict=True)
         missing |= {number: key for (key, number), content in found if content is None}

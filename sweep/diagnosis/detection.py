@@ -36,6 +36,9 @@ KNOTS = (7, 6)
 # Shares of the poses below the knots of the ambiguity: flips are where it is near 1.
 AMBIGUITY_SHARES = (0.02, 0.4, 0.7, 0.85, 0.93, 0.98, 0.998)
 
+# Numbers of poses beyond which they are none: m, radian.
+MOST = 1e6
+
 # Solved poses from which on a model is made.
 MIN_POSES = 2000
 
@@ -100,6 +103,7 @@ class DetectionModel:
         ambiguity
             Reprojection error of the chosen solution over that of the other one (n,), both of
             `cv2.solvePnPGeneric`; without it the flip's probability is that of the middle one.
+            Where it is NaN, below 0 or above all that were seen, nothing is known.
 
         Returns
         -------
@@ -108,22 +112,29 @@ class DetectionModel:
             rotation about x, y, z (rad), along and about the camera's axes: subtract the bias from
             the position, and turn back by it, before the covariance describes what is left, if the
             pose is not flipped. ``flip_probability``; ``known``: False, and all others NaN, where
-            the simulation has too few poses.
+            the simulation has too few poses, and for poses that cannot be (NaN, behind the camera).
+            A pose does not show which camera, dictionary, refinement and light it comes from: the
+            model is of those that were simulated alone.
         """
-        rvec, tvec = (np.atleast_2d(np.asarray(each, dtype=np.float64)) for each in (rvec, tvec_m))
+        rvec, tvec = (np.asarray(each, np.float64).reshape(-1, 3) for each in (rvec, tvec_m))
+        middle = math.exp(float(np.median(self.ambiguity_knots)))
+        ratio = np.broadcast_to(np.ravel(middle if ambiguity is None else ambiguity), len(tvec))
+        # Of what no solver returns nothing is known, and the others are not disturbed by it.
+        known = (np.abs(np.hstack([rvec, tvec])) < MOST).all(axis=1) & (tvec[:, 2] > 0)
+        known &= (ratio >= 0) & (ratio <= max(1.0, math.exp(self.ambiguity_knots[-1])))
+        rvec, tvec = (np.where(known[:, None], each, [0.0, 0.0, 1.0]) for each in (rvec, tvec))
+        ratio = np.where(known, ratio, middle)
         turn, at = frames(rvec, tvec), _conditions(rvec, tvec, self.focal_size_px_m)
         basis = hat_basis(at, [self.side_knots, self.angle_knots])
         first, last = ([self.side_knots[k], self.angle_knots[k]] for k in (0, -1))
-        known = ((at >= first) & (at <= last)).all(axis=1)
+        known &= ((at >= first) & (at <= last)).all(axis=1)
         known &= bearing_of(tvec) <= self.max_bearing_deg
         known &= ((basis > 0) <= (self.poses >= MIN_AT_KNOT)).all(axis=1)
         covariance = turn @ _of_symmetric(
             np.einsum("nk,kij->nij", basis, self.log_covariance), np.exp) @ turn.transpose(0, 2, 1)
+        covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         bias = np.einsum("nij,nj->ni", turn, basis @ self.bias)
         bias += self.shift * _lengths(tvec[:, 2])
-        middle = math.exp(float(np.median(self.ambiguity_knots)))
-        ratio = np.broadcast_to(
-            np.asarray(middle if ambiguity is None else ambiguity, dtype=np.float64), len(tvec))
         odds = _flip_basis(at, ratio, self.flip_knots) @ self.flips
         for values in (covariance, bias, odds):
             values[~known] = np.nan
@@ -176,8 +187,8 @@ def error_model(
     Raises
     ------
     StoreError, DatasetError
-        If there is no store, fewer than 2,000 solved poses or 50 of photographs, or several
-        settings.
+        If there is no store, fewer than 2,000 solved poses that differ, are not flipped and have
+        two solutions, or 50 of photographs, several settings, focal lengths or sizes.
 
     Examples
     --------
@@ -246,10 +257,15 @@ def judged(model: DetectionModel, results: xr.Dataset) -> xr.Dataset:
 def of_simulation(results: xr.Dataset) -> DetectionModel:
     """Return the model of a simulation's poses."""
     errors, rvec, tvec, ratio, flipped, _ = estimated(results)
-    if len(tvec) < MIN_POSES:
-        raise DatasetError(f"{len(tvec):,} solved poses; a model of one detection needs "
-                           f"{MIN_POSES:,} or more: more trials")
-    focal_size = float(focal_size_of(results).mean())
+    count = min(len(np.unique(errors[~flipped], axis=0)), int((ratio > 0).sum()))
+    if count < MIN_POSES:
+        raise DatasetError(f"{count:,} solved poses that are not flipped, differ and have two "
+                           f"solutions; a model of one detection needs {MIN_POSES:,} or more: "
+                           "more trials, noise, or solver ippe")
+    focal_sizes = focal_size_of(results)
+    focal_size = float(focal_sizes.mean())
+    if not np.allclose(focal_sizes, focal_size, rtol=1e-3):
+        raise DatasetError("several focal lengths or sizes of the marker: expected a model of each")
     at = _conditions(rvec, tvec, focal_size)
     # Across the line of sight, where errors are small: those along it would hide the shift.
     across = sight_rotation(tvec).transpose(0, 2, 1)[:, :2]

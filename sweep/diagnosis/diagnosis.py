@@ -21,11 +21,12 @@ SHOWN = 6
 # Posterior probability from which on a cause is shown.
 LEAST_SHARE = 0.001
 
-COMPONENTS = ("x", "y", "z", "tape")
-
 # Squared misfit beyond the number of rows, in units of its standard deviation sqrt(2 d), at which
 # even the likeliest cause does not explain the rows: (misfit - d)² > 16 * 2 d.
 SURPRISING = 16.0
+
+# Log-likelihood of a yaw below which none of them is explained: 2.8 standard deviations.
+SURPRISING_YAW = -6.5
 
 
 def diagnose(
@@ -52,7 +53,8 @@ def diagnose(
     zero_sd_m
         Standard deviation of the tape's zero point, in metres.
     compared
-        The number that was compared with the tape: "z", the third number of tvec, or "range".
+        The number that was compared with the tape: "z", the third number of tvec, or "range". Where
+        z was measured, too, z was compared with that.
     output
         A PNG or SVG file for the figure of residuals.
 
@@ -95,7 +97,7 @@ def diagnose(
         "What they mean, and the test that decides", ("cause", "meaning", "test"),
         [(cause.name, cause.title, cause.test) for cause in single.values()], words=True)
     row, component = rows.cells
-    value, components = rows.measured[rows.cells], [COMPONENTS[k] for k in component]
+    value, components = rows.measured[rows.cells], [("x", "y", "z", "tape")[k] for k in component]
     predictions = Table.of(
         "What the tape should have read, m, if it is this cause",
         ("row", "measured", "m",
@@ -129,11 +131,12 @@ def size_of(each: inference.Explanation, rows: Observations) -> str:
     numbers = zip(each.numbers, np.sqrt(np.diagonal(each.covariance)), strict=True)
     for cause, way in zip(each.causes, each.way, strict=True):
         (scale, unit), ratio, spread = cause.unit, way["ratio"][0], way["spread"][0]
-        for _, (mean, sd) in zip(cause.columns(rows, np.ones((1, 1, 3)), np.ones(1)), numbers,
-                                 strict=False):
+        columns = cause.columns(rows, np.ones((1, 1, 3)), np.ones(1))
+        for axis, _, (mean, sd) in zip("xyz", columns, numbers, strict=False):
             texts.append(f"said is {ratio / (1.0 + spread * mean):.4g} times the truth "
                          f"(± {100.0 * spread * sd:.2g} %)" if spread else
-                         f"{scale * mean:+.3g} ± {scale * sd:.2g} {unit}")
+                         f"{f'{axis} ' * (len(columns) > 1)}"
+                         f"{scale * mean:+.2f} ± {scale * sd:.2g} {unit}")
     return "; ".join([*texts, *(label for way in each.way for label in way["label"] if label)])
 
 
@@ -144,16 +147,15 @@ def _sentence(
     """Return the answer in one sentence, with what to do."""
     misfit, test = float(first.misfit[first.best]), first.words("test", "; ")
     count = len(rows.cells[0])
-    if (misfit - count) ** 2 > 2.0 * SURPRISING * count and misfit > count:
-        return (f"No known cause explains these rows: even {first.words('name')} misses them by "
-                f"{np.sqrt(misfit / count):.2g} standard deviations; look for a mistaken "
-                "row, or state a larger tape_sd_m.")
+    if misfit - count > np.sqrt(2.0 * SURPRISING * count) or (
+            first.yaw_evidence < SURPRISING_YAW * np.isfinite(rows.yaw_off[:, 0]).sum()):
+        return ("No known cause explains these rows: look for a mistaken one, or sign of yaw_deg, "
+                "or state larger standard deviations.")
     if not first.names and (rows.side_px < READABLE_PX).any():
-        return ("What was said agrees with what was measured, but no detector reads so small a "
-                "square: are size_m and all distances in metres?")
+        return ("What was said agrees with what was measured, but no detector reads a square of "
+                f"{rows.side_px.min():.2g} px: are size_m and all distances in metres?")
     if not first.names:
-        return ("The numbers agree with what is expected: nothing is wrong that these rows could "
-                "show.")
+        return "All agrees with what is expected: nothing is wrong that these rows could show."
     if measurement is None:
         size = size_of(first, rows)
         return f"It is {first.words('title')}{': ' + size if size else ''}. To be sure: {test}."

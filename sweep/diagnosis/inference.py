@@ -40,16 +40,10 @@ FAR_SD = 0.25
 INCH = 25.4
 UNITS = (10.0, 100.0, 1000.0, INCH, INCH / 10.0, 1.0 / 0.3048, 1000.0 / INCH)
 
+# Ratios of resolutions, of crops and of binning: 1920 for 960, 1280, 1440 and 640, and back.
 FOCAL_RATIOS = {
-    2.0: "calibrated at twice the resolution, or without binning",
-    0.5: "calibrated at half the resolution, or with binning",
-    1.5: "calibrated at 1.5 times the resolution (1920 for 1280)",
-    2 / 3: "calibrated at 2/3 of the resolution (1280 for 1920)",
-    4 / 3: "calibrated with 4/3 of the rows or columns (crop of 4:3)",
-    0.75: "calibrated with 3/4 of the rows or columns (crop of 4:3)",
-    3.0: "calibrated at 3 times the resolution (1920 for 640)",
-    1 / 3: "calibrated at 1/3 of the resolution (640 for 1920)",
-}
+    each: f"calibrated at {each:.3g} times the resolution (another mode, crop or binning)"
+    for each in (2.0, 0.5, 1.5, 2 / 3, 4 / 3, 0.75, 3.0, 1 / 3)}
 
 
 # A way in which a cause is undone: logarithm of its prior probability; said position to true one,
@@ -64,13 +58,16 @@ WAY = np.dtype([
 
 def ways_of(
     matrix: Floats, label: Sequence[str] = ("",), weight: ArrayLike = 1.0,
-    ratio: ArrayLike = 1.0, spread: ArrayLike = 0.0, square: ArrayLike = 1.0,
+    ratio: ArrayLike = 1.0, spread: ArrayLike = 0.0, square: ArrayLike = 1.0, share: float = 1.0,
 ) -> Ways:
-    """Return the ways (c,) of one cause of matrices (c, 3, 3); a number stands for all of them."""
+    """Return the ways (c,) of one cause of matrices (c, 3, 3); a number stands for all of them.
+
+    They have a ``share`` of the cause's prior.
+    """
     ways = np.zeros(len(matrix), WAY)
     ways["matrix"], ways["ratio"], ways["spread"], ways["square"] = matrix, ratio, spread, square
     ways["log_weight"] = np.log(weight)
-    ways["log_weight"] -= np.logaddexp.reduce(ways["log_weight"])
+    ways["log_weight"] += math.log(share) - np.logaddexp.reduce(ways["log_weight"])
     ways["label"][: len(label)] = label
     return ways
 
@@ -138,36 +135,71 @@ def size_ratios(dictionary: str) -> dict[float, str]:
     >>> size_ratios("DICT_APRILTAG_36h11")[1.25]
     'the white margin taken for the edge (10/8)'
     """
-    n, beyond = (module_count(dictionary), overhang(dictionary)) if dictionary else (8, 0)
-    edge = n + 2 * beyond
-    found = {} if not beyond else {
-        edge / n: f"the outer border taken for the detected square ({edge}/{n})",
-        n / edge: f"the detected square taken for the outer border ({n}/{edge})",
-    }
-    # A wider square of a family with an overhang ends in white anyway.
-    margin = {} if beyond else {
-        (n + 2) / n: f"the white margin taken for the edge ({n + 2}/{n})",
-        (n - 2) / n: f"the bits taken for the square, without its border ({n - 2}/{n})",
-    }
-    if not dictionary:  # any family: with a margin or an overhang
-        margin |= {8 / 6: "the white margin taken for the edge (8/6)",
-                   7 / 5: "the white margin taken for the edge (7/5)",
-                   9 / 5: "the outer border taken for the detected square (9/5)",
-                   5 / 9: "the detected square taken for the outer border (5/9)"}
-    return found | margin | {
-        0.5: "half of the side", 2.0: "twice the side (or the side for its half)",
-        2**0.5: "the diagonal taken for the side"}
+    found = {0.5: "half of the side", 2.0: "twice the side (or the side for its half)",
+             2**0.5: "the diagonal taken for the side"}
+    # Modules of the square, and beyond it on each side: of the likely families if none is given.
+    for n, beyond in ([(module_count(dictionary), overhang(dictionary))] if dictionary
+                      else [(8, 0), (7, 0), (6, 0), (5, 2)]):
+        # A wider square of a family with an overhang ends in white anyway.
+        edge = n + 2 * (beyond or 1)
+        found |= {
+            edge / n: f"the outer border taken for the detected square ({edge}/{n})",
+            n / edge: f"the detected square taken for the outer border ({n}/{edge})",
+        } if beyond else {
+            edge / n: f"the white margin taken for the edge ({edge}/{n})",
+            (n - 2) / n: f"the bits taken for the square, without its border ({n - 2}/{n})"}
+    return found
 
 
-def _unit_ways(_: Observations) -> Ways:
-    # A size in other units makes tvec as long as it is itself, and f size / z stays the side in the
-    # image; a tvec in other units does not.
+# What is in other units: its name, the powers of the ratio in x, y and z and in the side of the
+# square in the image over f size / z, and its prior share.
+UNIT_KINDS = (
+    # As long as it is itself, such a size makes tvec; so does a tape in other units.
+    ("size_m, or the tape the other way,", (1, 1, 1), 0, 0.45), ("tvec", (1, 1, 1), 1, 0.45),
+    ("tvec_z_m alone", (0, 0, 1), 1, 0.09), ("tvec_x_m and tvec_y_m", (1, 1, 0), 0, 0.01))
+
+
+def _unit_ways(rows: Observations) -> Ways:
     ratio = np.array([unit**sign for unit in UNITS for sign in (1, -1)])
-    labels = [f"{name} {'longer' if each > 1 else 'shorter'} by {max(each, 1 / each):.4g}"
-              for name in ("size_m", "tvec") for each in ratio]
-    both = np.tile(ratio, 2)
-    return ways_of(np.eye(3) / both[:, None, None], labels, 1.0, both, NAMED_SD,
-                   np.concatenate([np.ones(len(ratio)), ratio]))
+    parts = []
+    for name, powers, larger, share in UNIT_KINDS:
+        # No detector reads a square that would be larger than the image, or a few pixels.
+        side = np.outer(ratio**larger, rows.side_px)
+        unread = rows.known_square & (side != np.clip(side, *SIDE_LIMITS_PX)).any(axis=1)
+        parts.append(ways_of(
+            np.eye(3) / (ratio[:, None] ** powers)[:, None], [
+                f"{name} {'longer' if each > 1 else 'shorter'} by {max(each, 1 / each):.4g}"
+                for each in ratio],
+            np.where(unread, 1e-6, 1.0), ratio, NAMED_SD, ratio**larger, share))
+    return np.concatenate(parts)
+
+
+def _moved_centre(rows: Observations, shift_px: Floats) -> Floats:
+    """Return said position to true one (c, 3, 3) where the image's centre is off by (c, 2) px."""
+    matrix = np.tile(np.eye(3), (len(shift_px), 1, 1))
+    if rows.camera is not None:
+        matrix[:, :2, 2] = shift_px / [rows.camera.fx_px, rows.camera.fy_px]
+    return matrix
+
+
+def _focal_ways(rows: Observations) -> Ways:
+    """Return a wrong focal length, and those of other resolutions with their image's centre.
+
+    With the centre c and the focal length f of an image that is r times as large, x / z is
+    (u - c) / f and should be (u - c / r) r / f: x + (1 - 1 / r) z c / f is true, and z / r, or z if
+    the image is a crop.
+    """
+    alone, ratio = ratios(FOCAL_RATIOS, 0.4, (0, 0, 1)), np.array([*FOCAL_RATIOS])
+    if rows.camera is None or not rows.lateral:
+        return alone
+    crop = _moved_centre(rows, np.outer(
+        1.0 - 1.0 / ratio, [rows.camera.cx_px, rows.camera.cy_px]))
+    resized = crop.copy()
+    resized[:, 2, 2] = 1.0 / ratio
+    alone["log_weight"] += math.log(0.7)
+    return np.concatenate([
+        alone, ways_of(resized, [*FOCAL_RATIOS.values()], 1.0, ratio, NAMED_SD, share=0.2),
+        ways_of(crop, [*FOCAL_RATIOS.values()], spread=NAMED_SD, share=0.1)])
 
 
 def along_sight(points: Floats) -> Floats:
@@ -180,53 +212,36 @@ def along_sight(points: Floats) -> Floats:
 OFFSET_SD_M, TURN_SD_DEG, BIAS_SD_PX, DELAY_SD_S = 0.1, 4.0, 1.5, 0.1
 
 
-def _offset_columns(rows: Observations, points: Floats, _spread: Floats) -> Sequence[Floats]:
-    return [OFFSET_SD_M * way for way in (
-        np.eye(3) if rows.spatial else along_sight(points)[None])]
-
-
 def _axis_ways(_: Observations) -> Ways:
     """Return a frame that is turned a little, and axes that are named or pointed otherwise."""
     swaps = [np.eye(3)[list(order)] * np.array(signs)[:, None]
              for order in itertools.permutations(range(3))
              for signs in itertools.product((1.0, -1.0), repeat=3)]
     labels = [", ".join(
-        f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]} is {axis}"
-        for row, axis in zip(swap, "xyz", strict=True)) for swap in swaps]
-    others = len(swaps) - 1  # the first is the frame as it is
-    return ways_of(np.stack(swaps), ["", *labels[1:]], [0.5, *[0.5 / others] * others])
-
-
-def _turn_columns(_: Observations, points: Floats, _spread: Floats) -> Sequence[Floats]:
-    return [np.radians(TURN_SD_DEG) * np.cross(axis, points) for axis in np.eye(3)]
-
-
-def _half_pixel_ways(rows: Observations) -> Ways:
-    camera = rows.camera
-    slopes = (0.5 / camera.fx_px, 0.5 / camera.fy_px) if camera is not None else (0.0, 0.0)
-    matrix = np.stack([np.eye(3)] * 2)
-    matrix[:, :2, 2] = np.outer([1.0, -1.0], slopes)
-    return ways_of(matrix, [
-        f"centres of pixels counted from {one} in one place, from {other} in the other"
-        for one, other in (("0.5", "0"), ("0", "0.5"))])
+        f"{way} is {'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}"
+        for row, way in zip(swap, ("right", "down", "away"), strict=True)) for swap in swaps]
+    # The first is the frame as it is, as likely as all 47 others.
+    return ways_of(np.stack(swaps), ["", *labels[1:]], [47.0, *[1.0] * 47])
 
 
 def _lateral(rows: Observations) -> str:
-    return "" if np.isfinite(rows.measured[:, :2]).any() else "measured x_m or y_m"
+    # Beyond the camera lies what has other axes, which z shows, too.
+    known = np.isfinite(rows.measured[:, :2]).any() or rows.said[:, 2].min() < 0
+    return "" if known else "measured x_m or y_m"
 
 
 def _known_square(rows: Observations) -> str:
     return "" if rows.known_square else "--camera and size_m"
 
 
-def _straight(rows: Observations) -> str:
-    if not rows.lateral or rows.compared != "z":
-        return "tvec_x_m and tvec_y_m beside tvec_z_m"
-    return "" if straight_differs(rows) else "rows farther from the optical axis"
-
-
 def straight_differs(rows: Observations) -> bool:
-    """Return whether z is another number than the straight distance in some row."""
+    """Return whether z was compared with the tape, and is another number than the range.
+
+    It was not where z was measured, too, or is behind the camera.
+    """
+    if rows.compared != "z" or np.isfinite(rows.measured[:, 2]).any() or (
+            rows.said[:, 2].min() < 0):
+        return False
     gap = np.linalg.norm(rows.said, axis=1) - rows.said[:, 2]
     seen = gap > 2.0 * np.hypot(rows.measured_sd[:, 3], rows.zero_sd_m)
     return bool(seen[np.isfinite(rows.measured[:, 3])].any())
@@ -248,21 +263,29 @@ CAUSES = (
     Cause("focal_length", "wrong focal length (resolution, another camera, crop, autofocus)", 2.5,
           "photograph a ruler at a known distance: f is its pixels times distance / length; "
           "compare the file's image size with the image's",
-          lambda _: ratios(FOCAL_RATIOS, 0.4, (0, 0, 1)),
-          lambda _, points, spread: [points * spread * [0.0, 0.0, 1.0]]),
+          _focal_ways, lambda _, points, spread: [points * spread * [0.0, 0.0, 1.0]]),
     Cause("units", "units taken for one another (m, cm, mm, inch, foot)", 1.0,
           "print size and tvec with their units", _unit_ways, _scaled),
-    Cause(STRAIGHT, "z taken for the straight distance", 1.5,
-          "compare the tape with sqrt(x² + y² + z²)", lacks=_straight),
+    Cause(STRAIGHT, "z taken for the straight distance, which tvec has right", 1.5,
+          "compare the tape with sqrt(x² + y² + z²)",
+          lacks=lambda rows: "" if straight_differs(rows) else "a tape off the axis beside z"),
     Cause("offset", "an offset (zero point of the tape, place of the lens, another frame)", 1.0,
           "measure one more distance: an offset stays, a factor grows",
-          columns=_offset_columns, unit=(1e3 * OFFSET_SD_M, "mm")),
+          columns=lambda rows, points, _: [*(OFFSET_SD_M * (
+              np.eye(3) if rows.spatial else along_sight(points)[None]))],
+          unit=(1e3 * OFFSET_SD_M, "mm")),
     Cause("axes", "axes or frame turned", 1.0,
           "move the marker to the right: x alone must grow; down: y; away: z",
-          _axis_ways, _turn_columns, _lateral, (TURN_SD_DEG, "degrees")),
+          _axis_ways,
+          lambda _, points, _spread: [
+              np.radians(TURN_SD_DEG) * np.cross(axis, points) for axis in np.eye(3)],
+          _lateral, (TURN_SD_DEG, "degrees")),
     Cause("half_pixel", "half a pixel (convention of corners or calibration)", 0.7,
           "detect a rendered marker whose corners are known (`sweep export`)",
-          _half_pixel_ways, lacks=lambda rows: _lateral(rows) or _known_square(rows)),
+          lambda rows: ways_of(_moved_centre(rows, np.array([[0.5, 0.5], [-0.5, -0.5]])), [
+              f"centres of pixels counted from {one} in one place, from {other} in the other"
+              for one, other in (("0.5", "0"), ("0", "0.5"))]),
+          lacks=lambda rows: _lateral(rows) or _known_square(rows)),
     Cause("refinement", "bias of the corner refinement", 1.0,
           "run the other refinement on the same images: its bias differs",
           columns=lambda rows, points, _: [-BIAS_SD_PX / rows.side_px[:, None] * points],
@@ -365,8 +388,8 @@ def predict(
     points = points * (1.0 - bias / side)
     sight = along_sight(points)
     # Change of what is measured with the position: a component, or along the line of sight.
-    along_z = rows.compared == "z" and straight_differs(rows) and all(
-        cause.name != STRAIGHT for cause in causes)
+    # The tape is straight; who finds z wrong has compared z with it, if no cause explains it.
+    along_z = straight_differs(rows) and causes[0].name == AGREE
     onto = np.where((component == 3)[:, None],
                     np.eye(3)[2] if along_z else sight[:, row], np.eye(4, 3)[component])
     moves = [move for cause, way in zip(causes, ways, strict=True)
@@ -378,7 +401,7 @@ def predict(
              for k in np.unique(component)]
     # Noise grows with the distance as measured: with that of the points a factor that brings them
     # near would explain many rows by less noise.
-    known = np.where(np.isfinite(rows.measured[:, 3]), rows.measured[:, 3], rows.measured[:, 2])
+    known = np.fmax(rows.measured[:, 3], rows.measured[:, 2])
     distance = np.where(np.isfinite(known), np.abs(known), np.linalg.norm(points, axis=-1))[:, row]
     focal = rows.camera.fx_px if rows.camera is not None else 1000.0
     along = (onto * sight[:, row]).sum(axis=-1)
@@ -402,14 +425,16 @@ def explain(rows: Observations, causes: tuple[Cause, ...], log_prior: float) -> 
     mean, columns, variance = predict(rows, causes, ways)
     residual = rows.measured[rows.cells] - mean
     weighted = columns / variance[..., None]
-    precision = np.eye(columns.shape[-1]) + np.einsum("cdk,cdl->ckl", columns, weighted)
-    covariance = np.linalg.inv(precision)
+    # By eigenvalues: an inverse of the sum fails where units make numbers of 1e15 beside the 1.
+    values, vectors = np.linalg.eigh(np.einsum("cdk,cdl->ckl", columns, weighted))
+    precision = 1.0 + np.maximum(values, 0.0)
+    covariance = (vectors / precision[:, None, :]) @ vectors.transpose(0, 2, 1)
     numbers = np.einsum("ckl,cdl,cd->ck", covariance, weighted, residual, optimize=True)
     # As a sum of squares: the shorter difference of two large numbers came out below zero.
     left = residual - np.einsum("cdk,ck->cd", columns, numbers)
     misfit = (left**2 / variance).sum(axis=-1) + (numbers**2).sum(axis=-1)
     joint = sum(each["log_weight"] for each in ways) - 0.5 * (
-        misfit + np.log(2.0 * math.pi * variance).sum(axis=-1) + np.linalg.slogdet(precision)[1])
+        misfit + np.log(2.0 * math.pi * variance).sum(axis=-1) + np.log(precision).sum(axis=-1))
     yaw = _yaw_evidence(rows, FLIP_SHARE if any(cause.name == FLIPS for cause in causes) else 0.0)
     k = int(np.argmax(joint))
     return Explanation(
@@ -434,10 +459,13 @@ def rank(rows: Observations) -> list[Explanation]:
     """Return all explanations of observations, by posterior probability."""
     found = [cause for cause in CAUSES if not cause.lacks(rows)]
     total = sum(cause.prior for cause in found)
-    paired = [cause for cause in found if cause.name not in {AGREE, "units"}]
+    paired = [cause for cause in found if cause.name not in {AGREE, "units", STRAIGHT}]
     explanations = [
+        # Who finds z wrong, and compared it with a straight tape, has made that mistake, too.
         explain(rows, causes, math.log(
-            PAIRS_PRIOR ** (len(causes) - 1) * math.prod(cause.prior / total for cause in causes)))
+            PAIRS_PRIOR ** (len(causes) - 1 + (
+                straight_differs(rows) and causes[0].name not in {AGREE, STRAIGHT}))
+            * math.prod(cause.prior / total for cause in causes)))
         for causes in [*((cause,) for cause in found), *itertools.combinations(paired, 2)]]
     evidence = np.array([each.log_evidence for each in explanations])
     share = np.exp(evidence - np.logaddexp.reduce(evidence))
@@ -501,7 +529,6 @@ def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> Meas
         [np.sin(bearing), np.zeros_like(bearing), np.cos(bearing)], axis=-1)
     # The program's answer if a were right.
     said = truth @ np.linalg.inv(undo).T
-    said[:, 2] = np.maximum(said[:, 2], 1e-3)
     unknown = np.full((len(said), 2), np.nan)
     new = dataclasses.replace(
         rows, said=said, lateral=True, yaw_off=unknown, yaw_sd=unknown[:, 0],

@@ -50,8 +50,8 @@ NEEDED = {
 # Column -> numbers between which it can be, in whatever unit.
 MOST_M = 1e7
 RANGES = {
-    **dict.fromkeys((*TVEC[:2], *MEASURED), (-MOST_M, MOST_M)),
-    **dict.fromkeys(("tvec_z_m", "range_m", "tape_m"), (1e-5, MOST_M)),
+    **dict.fromkeys((*TVEC, *RVEC, *MEASURED, "yaw_deg", "speed_m_s"), (-MOST_M, MOST_M)),
+    **dict.fromkeys(("range_m", "tape_m"), (1e-5, MOST_M)),
     **dict.fromkeys(("tape_sd_m", "position_sd_m", "yaw_sd_deg"), (1e-9, MOST_M))}
 
 # Standard deviation of a tape if none is given: the larger of 2 mm and 0.5 %.
@@ -78,8 +78,8 @@ REFINEMENTS: dict[str, tuple[float, float, float, float]] = {
 UNKNOWN_REFINEMENT = (0.4, 0.6, 0.6, 0.3)
 UNKNOWN_SIDE_PX = 80.0
 
-# Rows that are judged within half a minute.
-MAX_ROWS = 1000
+# Rows that are judged within ten seconds and a gigabyte.
+MAX_ROWS = 200
 
 # Sides below this cannot be read: the numbers are in other units than the size.
 READABLE_PX = 4.0
@@ -185,7 +185,9 @@ class Observations:
         """Side of the square in the image (n,), as the program's own numbers have it."""
         if self.camera is None or not self.known_square:
             return np.full(len(self.said), UNKNOWN_SIDE_PX)
-        return np.asarray(self.camera.fx_px * self.size_m / self.said[:, 2])
+        # In other axes z is no depth: no lens of a pinhole camera sees beyond 60 degrees.
+        depth = np.maximum(self.said[:, 2], np.linalg.norm(self.said, axis=1) / 2.0)
+        return np.asarray(self.camera.fx_px * self.size_m / depth)
 
     @property
     def expected(self) -> tuple[float, float, float, float]:
@@ -214,8 +216,6 @@ def read_observations(
     if IMAGE in cells:
         images = [folder / name for name in cells[IMAGE]]
         table[CORNERS] = _detected(table, images, settings["dictionary"], settings["refinement"])
-        notes.append("corners were detected in the images, "
-                     f"{settings['refinement'] or 'none'} refined")
     there = table.notna()
     for name, others in NEEDED.items():
         _each_row(~there[name] | there[others].any(axis=1),
@@ -228,10 +228,14 @@ def read_observations(
         notes.append("the poses were solved from the corners with this camera and size")
     lateral = bool(np.isfinite(said[:, :2]).all())
     if not lateral:
-        said = np.outer(table["tvec_z_m"].fillna(table["range_m"]), [0.0, 0.0, 1.0])
-        settings["compared"] = "range"
-    _each_row(np.isfinite(said).all(axis=1),
-              "expected tvec_z_m or range_m above 0: the position that the program said")
+        # A row with all three numbers keeps its range.
+        distance = pd.Series(np.linalg.norm(said, axis=1)).fillna(table["range_m"])
+        said = np.outer(distance.fillna(table["tvec_z_m"]), [0.0, 0.0, 1.0])
+    # In other axes z may be anything, which the measured position shows.
+    shown = lateral & there[MEASURED[:3]].any(axis=1)
+    _each_row(np.where(shown, np.linalg.norm(said, axis=1), said[:, 2]) >= 1e-5,
+              "expected tvec_z_m or range_m above 0, the position that the program said; of other "
+              "axes expected x_m, y_m and z_m, too")
     _each_row(there[[*MEASURED, "yaw_deg"]].any(axis=1),
               "expected tape_m, or one of x_m, y_m, z_m: what was measured by tape")
     _each_row(lateral | ~there[MEASURED[:2]].any(axis=1),
@@ -255,11 +259,6 @@ def read_observations(
     if not rows.known_square:
         notes.append("camera or size_m unknown: the expected bias and noise are a guess for a "
                      f"square of {UNKNOWN_SIDE_PX:g} px")
-    elif (small := rows.side_px < READABLE_PX).any():
-        row = int(np.argmax(small))
-        notes.append(
-            f"row {row + 1}: {said[row, 2]:g} m for a square of {rows.size_m:g} m is a side of "
-            f"{rows.side_px[row]:.2g} px, which no detector reads: units of tvec or size_m differ")
     return replace(rows, notes=tuple(notes))
 
 
@@ -306,7 +305,8 @@ def _numbers(cells: pd.DataFrame) -> pd.DataFrame:
                          f"expected {', '.join(COLUMNS[:-7])} ..., or {IMAGE}, with commas between "
                          "them")
     if not 0 < len(cells) <= MAX_ROWS:
-        raise _fault(f"{len(cells) or 'no'} rows: expected 1 to {MAX_ROWS} below the header")
+        raise _fault(f"{len(cells) or 'no'} rows: expected 1 to {MAX_ROWS} below the header; "
+                     "average those of one pose")
     table = cells.reindex(columns=COLUMNS).replace("", None)
     numbers = table.apply(pd.to_numeric, errors="coerce").astype(np.float64)
     for name in cells.columns.intersection(COLUMNS):
@@ -347,10 +347,10 @@ def _detected(
 def _solved(corners: Floats, camera: Calibration, size_m: float) -> tuple[Floats, Floats]:
     """Return positions and rotation vectors (n, 3) of corners (n, 8), by guarded IPPE."""
     quads = corners.reshape(-1, 4, 2)
-    frame = (camera.width_px, camera.height_px)
-    if all(frame) and (quads > np.array(frame, dtype=np.float64)).any():
+    frame = np.array([camera.width_px or 0, camera.height_px or 0], dtype=np.float64)
+    if frame.all() and ((quads < -0.5) | (quads > frame)).any():
         raise _fault("corners lie beyond the camera file's image of "
-                     f"{frame[0]} x {frame[1]} px: expected the calibration of their images")
+                     f"{frame[0]:g} x {frame[1]:g} px: expected the calibration of their images")
     cameras = cameras_of(camera, len(quads))
     rotation, position = both_planar_solutions(quads, cameras, np.full(len(quads), size_m))
     _each_row(np.isfinite(position[:, 0]).all(axis=-1), "the corners have no pose; expected top "

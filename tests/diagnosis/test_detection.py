@@ -76,10 +76,21 @@ def test_a_factor_from_photographs_widens_the_covariance_to_their_errors(model):
         widened(model, seen.isel(trial=slice(40)))
 
 
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda drawn: drawn.isel(trial=np.zeros(6000, int)), "1 solved poses"),
+    (lambda drawn: drawn.assign(flipped=drawn["flipped"] * 0 + Flipped.flipped), "0 solved poses"),
+    (lambda drawn: drawn.assign(reprojection_error_px=drawn["reprojection_error_px"] * 0), "two"),
+    (lambda drawn: drawn.assign_coords(side_px=drawn["side_px"] * drawn["trial"]), "several f")])
+def test_a_store_that_shows_no_errors_or_several_cameras_is_refused(change, words):
+    with pytest.raises(DatasetError, match=words):
+        error_model(change(drawn(1)))
+
+
 def test_outside_what_was_simulated_nothing_is_known_also_from_json(model):
     frontal = [np.pi, 0.0, 0.0]
-    found = model.at([frontal] * 3, [[0, 0, 2.0], [0, 0, 9.0], [3.0, 0, 2.0]], 0.1)
-    assert found["known"].values.tolist() == [True, False, False]
+    away = [[0, 0, 2.0], [0, 0, 9.0], [3.0, 0, 2.0], [0, 0, -2.0], [np.nan, 0, 2.0], [0, 0, 2.0]]
+    found = model.at([frontal] * 6, away, [0.1, 0.1, 0.1, 0.1, 0.1, np.nan])
+    assert found["known"].values.tolist() == [True] + [False] * 5
     assert np.isnan(found["covariance"].values[1:]).all()
     assert np.isnan(found["flip_probability"].values[1:]).all()
     other = DetectionModel.from_json(model.to_json())

@@ -11,7 +11,7 @@ import tomlkit
 
 import sweep
 from sweep.cli import main
-from sweep.diagnosis.observations import CORNERS, read_observations
+from sweep.diagnosis.observations import CORNERS, MEASURED, TVEC, read_observations
 from sweep.model.calibration import Calibration
 
 CAMERA = Calibration(1280, 720, 900.0, 900.0, 639.5, 359.5, (), (), ())
@@ -24,14 +24,24 @@ def first(found):
     return found.numbers["causes"][0]["causes"]
 
 
-@pytest.mark.parametrize(("lateral", "cause"), [(1.0, "focal_length"), (1.3, "size")])
-def test_size_is_told_from_focal_length_off_the_axis(lateral, cause):
-    truth = np.array([[0, 0, 0.5], [0.2, 0, 1], [-0.4, 0.1, 2]])
-    x, y, z = (truth * [lateral, lateral, 1.3]).T
-    found = sweep.diagnose(
-        {"tvec_x_m": x, "tvec_y_m": y, "tvec_z_m": z, "x_m": truth[:, 0],
-         "tape_m": np.linalg.norm(truth, axis=1)}, camera=CAMERA, size_m=0.1, compared="range")
+CENTRE = 0.5 * np.array([[0, 0, 639.5], [0, 0, 359.5], [0, 0, 0]]) / 900
+"""What an image of 640 x 360 px adds to x and y of poses of z, by the calibration of 1280 x 720."""
+
+
+@pytest.mark.parametrize(("mistake", "cause", "size"), [
+    (np.diag([1.0, 1.0, 1.35]), "focal_length", ""), (1.25 * np.eye(3), "size", "(10/8)"),
+    (np.diag([1.0, 1.0, 2.0]) - 2 * CENTRE, "focal_length", "2 times the resolution"),
+    (np.diag([1.0, 1.0, 1000.0]), "units", "tvec_z_m alone longer by 1000"),
+    (1000 * np.eye(3), "units", "size_m, or"), (np.eye(3), "agree", ""),
+    (np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), "axes", "right is -y, down is -z, away is x")])
+def test_causes_are_told_off_the_axis_beside_a_straight_tape(mistake, cause, size):
+    truth = np.array([[0, 0.02, 0.5], [0.2, 0, 1], [-0.4, 0.1, 1.5]])
+    columns = dict(zip([*TVEC, *MEASURED], [
+        *mistake @ truth.T, *truth.T, np.linalg.norm(truth, axis=1)], strict=True))
+    found = sweep.diagnose(columns, camera=CAMERA, size_m=50 if "size_m" in size else 0.1,
+                           dictionary="DICT_6X6_50")
     assert (first(found), found.status) == ([cause], 0)
+    assert size in found.numbers["causes"][0]["size"]
 
 
 def test_on_the_axis_they_are_confounded_and_a_row_off_it_would_decide():
@@ -57,14 +67,23 @@ def test_rows_that_agree_are_said_to(away, words):
     ({"tvec_z_m": [1], "yaw_deg": [20]}, "needs rvec_x or corner0_x_px"),
     ({"range_m": [1.0], "tape_m": ["nan"]}, "row 1, tape_m = nan"),
     ({"range_m": [1.0, ""], "tape_m": [1.0, 2.0]}, "row 2: expected tvec_z_m or range_m"),
-    ({"rang_m": [1.0]}, "did you mean range_m?"), ({"range_m": [1, 2]}, "same length"),
+    ({"tvec_z_m": [-1.0]}, "above 0"), ({"rang_m": [1.0]}, "did you mean range_m?"),
+    ({"range_m": [1, 2]}, "same length"),
     ({"range_m": [1.0], "tape_sd_m": [0.0]}, "tape_sd_m = 0.0: expected a number between"),
-    ({"tape_m": []}, "no rows"), ({"tape_m": [1.0] * 1001}, "1001 rows"),
+    ({"tape_m": []}, "no rows"), ({"tape_m": [1.0] * 201}, "201 rows"),
 ])
 def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
     with pytest.raises(sweep.ArgumentError, match=re.escape(words)) as error:
         sweep.diagnose({"tape_m": [1.0]} | columns)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("columns", "words"), [
+    ({"range_m": [1e6, 2e6], "tape_m": [1.0, 2.0]}, "No known cause"),
+    ({"tvec_z_m": [1], "rvec_x": [3.1], "rvec_y": [0], "rvec_z": [0], "yaw_deg": [30]}, "No known"),
+    ({"tvec_x_m": [0.6], "tvec_y_m": [0], "tvec_z_m": [0.8], "tape_m": [1]}, "tvec has right")])
+def test_what_no_cause_explains_is_said(columns, words):
+    assert words in sweep.diagnose(columns).numbers["sentence"]
 
 
 def test_poses_are_solved_from_corners_in_the_cameras_image():

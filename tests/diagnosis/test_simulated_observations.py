@@ -111,8 +111,8 @@ def observation(seed, pairs):
         rows = scene(rng)
         looked_for = [cause.name for cause in CAUSES if not cause.lacks(rows)]
         if pairs:
-            names = rng.choice([
-                name for name in looked_for if name not in {"agree", "units"}], 2, replace=False)
+            paired = [name for name in looked_for if name not in {"agree", "units", STRAIGHT}]
+            names = rng.choice(paired, 2, replace=False)
         else:
             names = rng.choice([*looked_for, *["agree"] * len(looked_for)], 1)
         # Sound rows are those of a reader who compares like with like.

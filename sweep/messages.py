@@ -189,18 +189,6 @@ def _json_value(value: Any) -> tuple[Any, Any]:
     return value if isinstance(value, (str, bool, int, float, type(None))) else str(value), None
 
 
-def byte_count(count: int) -> str:
-    """Return a number of bytes with a decimal prefix.
-
-    >>> byte_count(999), byte_count(332_000), byte_count(10**9 - 1)
-    ('999 bytes', '332 kB', '1 GB')
-    """
-    count = int(float(f"{count:.3g}"))
-    units = ("bytes", "kB", "MB", "GB", "TB", "PB")
-    power = min((len(str(count)) - 1) // 3, len(units) - 1)
-    return f"{count / 1000**power:.3g} {units[power]}"
-
-
 def duration(seconds: float) -> str:
     """Return a time in the largest unit of which there are at least two.
 

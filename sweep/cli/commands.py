@@ -11,13 +11,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
 
+from rich import filesize
+
 import sweep
 from sweep import library
 from sweep.cli import command as cli
 from sweep.cli.command import Names, Numbers
 from sweep.errors import ArgumentError, check_positive
 from sweep.isolation.child_process import Child, default_workers
-from sweep.messages import byte_count, duration, plain, quoted
+from sweep.messages import duration, plain, quoted
 
 if TYPE_CHECKING:
     from sweep.evaluation.inspection import SceneInspection
@@ -251,8 +253,9 @@ def _expected(pipeline: Pipeline, expected: SimpleNamespace) -> list[str]:
         "poses": poses,
         "results": f"{most}{expected.results:,}",
         "blocks": f"{expected.blocks:,} of {' x '.join(map(str, expected.block)) or '1'} poses",
-        "store": f"{byte_count(expected.bytes)} before compression, in {expected.files:,} files",
-        "memory": f"{byte_count(expected.worker_bytes)} a worker",
+        "store": f"{filesize.decimal(expected.bytes)} before compression, "
+                 f"in {expected.files:,} files",
+        "memory": f"{filesize.decimal(expected.worker_bytes)} a worker",
         "cost": f"{over}{1e3 * expected.pose_s:.3g} ms a pose ({sampled}{ended})",
         "time": f"{most}{over}{duration(expected.seconds)} {how}",
     }
@@ -966,7 +969,8 @@ def export(
             read, folder, windowed=windowed, workers=workers, yes=yes,
             progress=lambda done, count: stage(f"rendering {count:,} scenes", done / count))
     without = f", {result.invisible:,} scenes without" if result.invisible else ""
-    lines = [f"{result.folder}: {result.images:,} images, {byte_count(result.bytes)}{without}"]
+    size = filesize.decimal(result.bytes)
+    lines = [f"{result.folder}: {result.images:,} images, {size}{without}"]
     if result.kept:
         lines.append(f"{result.kept:,} were there already, {result.written:,} written now")
     if result.damaged:

@@ -20,6 +20,7 @@ import xarray as xr
 import yaml
 from jinja2 import Template
 from numpy.typing import NDArray
+from rich import filesize
 
 from sweep.errors import RunError, StoreError, check_positive
 from sweep.evaluation.opencv_threads import single_threaded
@@ -30,7 +31,7 @@ from sweep.execution.forecast import free_bytes
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import LABELS
 from sweep.measure.flags import DetectionStatus
-from sweep.messages import byte_count, label, plain
+from sweep.messages import label, plain
 from sweep.model.polygon import signed_areas
 from sweep.model.renderers import render
 from sweep.model.scene import Scenes
@@ -532,7 +533,6 @@ def _check_size(pipeline: Pipeline, folder: Path, count: int, windowed: bool) ->
     free = free_bytes(str(folder))
     if total > min(MAX_BYTES, free):
         raise StoreError(
-            f"{plain(folder, 300)}: the export takes about {byte_count(total)} in {count:,} files, "
-            f"and {byte_count(int(min(free, 1e18)))} are free; choose fewer scenes, windows, "
-            "or confirm it with --yes (in Python, yes=True)"
-        )
+            f"{plain(folder, 300)}: the export takes about {filesize.decimal(total)} in {count:,} "
+            f"files, and {filesize.decimal(int(min(free, 1e18)))} are free; choose fewer scenes, "
+            "windows, or confirm it with --yes (in Python, yes=True)")

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
+from rich import filesize
 
 from sweep.errors import MachineFaultError
 from sweep.evaluation.block import run_cells
@@ -21,7 +22,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildError, default_workers
 from sweep.isolation.watchdog import compilation_s
-from sweep.messages import byte_count, duration
+from sweep.messages import duration
 from sweep.sampling.rules import Stopping, block_unit, make_rule
 from sweep.store.locations import is_remote
 
@@ -278,8 +279,8 @@ def forecast_of(
         objections.append(f"takes {about} {duration(seconds)} with {workers} "
                           f"worker{'s' if workers > 1 else ''}")
     if size > free:
-        objections.append(f"writes {byte_count(size)} before compression, and "
-                          f"{byte_count(int(free))} are free")
+        objections.append(f"writes {filesize.decimal(size)} before compression, and "
+                          f"{filesize.decimal(int(free))} are free")
     files = left * (len(pipeline.experiment.variables) + 1)  # and a receipt
     return SimpleNamespace(files=files, bytes=size, seconds=seconds, objections=objections)
 

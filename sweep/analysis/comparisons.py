@@ -894,7 +894,7 @@ class SolvedQuantile(Statistic[Poses]):
 GAP_STATISTICS: tuple[ComparedRate | SolvedQuantile, ...] = (
     *(ComparedRate(each.name, each.meaning, each.successes, each.used)
       for each in (DETECTION_RATE, estimator.FLIP_RATE)),
-    SolvedQuantile("range_bias_percent", "median depth error of the true depth, solved",
+    SolvedQuantile("range_bias_median_percent", "median depth error of the true depth, solved",
                    lambda poses: poses.range_percent[..., 0], units="percent"),
     *(SolvedQuantile(
         quantity.named(statistic), f"{percent} % quantile of the absolute {quantity.words}, solved",
@@ -938,7 +938,7 @@ def simulation_gap(
         - ``looked_for``, ``solved``: markers, times repeats; ``units``: photographs, or scenes of
           a simulation, that have any.
         - ``detection_rate`` of ``looked_for``, ``flip_rate`` of ``solved``.
-        - ``range_bias_percent``: median depth error of the solved; ``rotation_median_deg``,
+        - ``range_bias_median_percent``: median depth error of the solved; ``rotation_median_deg``,
           ``rotation_p90_deg``, ``range_median_percent``, ``range_p90_percent``: quantiles of their
           absolute errors.
         - ``x_gap`` of each: simulated minus photographs of rates and of the bias, simulated over

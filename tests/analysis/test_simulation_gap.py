@@ -30,7 +30,7 @@ def test_values_are_numpys_and_gaps_their_differences_and_ratios():
     for refinement in REFINEMENTS:
         at = gap.sel(cornerRefinementMethod=refinement)
         for name, share, ratio in (
-            ("range_bias_percent", 0.5, False), ("rotation_median_deg", 0.5, True),
+            ("range_bias_median_percent", 0.5, False), ("rotation_median_deg", 0.5, True),
             ("rotation_p90_deg", 0.9, True), ("range_median_percent", 0.5, True),
             ("range_p90_percent", 0.9, True),
         ):
@@ -70,7 +70,7 @@ def test_twins_are_paired_by_their_photographs():
     for second in (same, shuffled.assign_coords(trial=range(PHOTOGRAPHS))):
         gap = simulation_gap(first, second)
         for name, low, high in (
-                ("rotation_median_deg", 0.85, 1.18), ("range_bias_percent", -0.11, 0.11)):
+                ("rotation_median_deg", 0.85, 1.18), ("range_bias_median_percent", -0.11, 0.11)):
             assert (gap[f"{name}_gap"] == (low > 0)).all()
             assert (gap[f"{name}_gap_low"] > low).all()  # of others it is 0.4 and -0.8
             assert (gap[f"{name}_gap_high"] < high).all()
@@ -166,7 +166,8 @@ def test_intervals_hold_what_is_true(photographs, correlation, shared, claim):
         names = ("trial", [f"{n}" for n in range(photographs)])
         sides.append(found.assign_coords(photographs="shots", photograph=names, sha256=names))
     gap = simulation_gap(sides[0], sides[1].assign_coords(simulated=True))
-    for name, true, none in (("range_bias_percent", 0.0, 0.0), ("rotation_median_deg", 1.0, 1.0),
+    for name, true, none in (("range_bias_median_percent", 0.0, 0.0),
+                             ("rotation_median_deg", 1.0, 1.0),
                              ("rotation_p90_deg", np.exp(stats.norm.ppf(0.9)), 1.0)):
         for ending, value, least in (("", true, 0.90), ("_gap", none, 0.93)):
             low, high = (gap[f"{name}{ending}{end}"] for end in ("_low", "_high"))

@@ -23,10 +23,10 @@ def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():
         "compared by", "gap"]
     assert len(table.rows) == 7 * 2 * 2
     row = next(row for row in table.rows
-               if row[:3] == ["range bias, %", "subpix", "20\u201340"])
+               if row[:3] == ["range bias median, %", "subpix", "20\u201340"])
     at = gap.sel(cornerRefinementMethod="subpix").isel(side_px=0)
     assert float(row[3].replace("\u2212", "-")) == pytest.approx(
-        at.range_bias_percent.values[0], rel=0.01)
+        at.range_bias_median_percent.values[0], rel=0.01)
     assert "to" in row[6]
     assert gap_lines(gap) == ["12 photographs and their twins, pairs of markers"]
     few = simulation_gap(results_of(rng, 3), second)

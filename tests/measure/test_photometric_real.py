@@ -16,7 +16,7 @@ from support.solving import of_markers
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import state_of
-from sweep.measure.photograph import draw, photograph_view, system
+from sweep.measure.photograph import HELD, SIZE, _write_cell, draw, photograph_view, system
 from sweep.measure.photometric import PhotometricReal
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings, with_neighbours
 from sweep.model.board import single_marker
@@ -170,7 +170,8 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
     turn, position = pose_of(CHARUCO, 5, pose)
     height, width = view.levels.shape
     work, (beyond, _, _) = system(height, width), system(height + 1, width)
-    draw(view, state_of(turn, position, 0.8, np.zeros(3)), work._replace(rates=beyond[:-1]))
+    state = state_of(turn, position, 0.8, np.array([0.0, 0.0, 1.0]))
+    draw(view, state, work._replace(rates=beyond[:-1]))
     assert not beyond.any()  # nothing is written below the image
     shifts = found.cameras.view[0, 2:] - view.marker.optics.intrinsics[2:]
     left, top = np.rint(shifts).astype(int)
@@ -194,6 +195,14 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
     for image_slope, expected in zip(work.images[2:5], slopes, strict=True):
         # Slopes are for directions of steps, not for poses: 1e-2 of the contrast a pixel.
         assert np.abs(image_slope[used] - expected).max() < 1e-2
+    # Those by the shifts of the four nodes around a pixel: products of hat functions.
+    for i, j in np.argwhere(used)[::7]:
+        columns = np.zeros((width, SIZE + 1 + HELD))
+        cell, _ = _write_cell(view, state, work.images, i, j, columns)
+        at = (view.at[::-1, i, j].clip(-1, 1) + 1) / 2 * 3  # of 3 x 3 cells
+        hats = 1 - np.abs(at[:, None] - np.array(divmod(cell, 3))[:, None] - [0, 1])
+        expected = np.multiply.outer(np.outer(*hats), -work.images[2:4, i, j])
+        assert columns[0, SIZE + 1 :] == pytest.approx(expected.ravel(), abs=1e-12)
 
 
 @pytest.mark.parametrize("seen", first_of([

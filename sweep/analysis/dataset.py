@@ -56,19 +56,21 @@ def of_photographs(results: xr.Dataset) -> bool:
     return PHOTOGRAPHS in results.coords
 
 
+def sections_of(name: object, results: xr.Dataset) -> set[str]:
+    """Return the sections of a dimension's parameters: one, or those that go together."""
+    attributes = results[name].attrs if name in results.coords else {}
+    return {PARAMETERS[each].section for each in str(attributes.get("zip", name)).split()
+            if each in PARAMETERS}
+
+
 def is_grid_axis(name: object, results: xr.Dataset) -> bool:
     """Return whether a dimension is of the camera, the marker or the pose: it makes cells.
 
     Of parameters that go together one such suffices. Photographs have no cells: what is seen in
     one photograph together counts as one draw, for its errors are correlated.
     """
-    if of_photographs(results):
-        return False
-    attributes = results[name].attrs if name in results.coords else {}
-    return any(
-        each in PARAMETERS and PARAMETERS[each].section in GEOMETRY_SECTIONS
-        for each in str(attributes.get("zip", name)).split()
-    )
+    return not of_photographs(results) and not sections_of(name, results).isdisjoint(
+        GEOMETRY_SECTIONS)
 
 
 def is_fixed(coordinate: xr.DataArray) -> bool:

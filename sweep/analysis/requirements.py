@@ -779,8 +779,8 @@ SIZES_BESIDE = ("size_m", "hfov_deg", "focal_length_mm", "fx_px", "width_px")
 
 IDS = "marker_id"
 
-#: The parameter by which boards differ, on an axis of its own or with others.
-BOARDS = "kind"
+#: Sections of which an axis without numbers has targets: dictionaries, boards.
+TARGETS = {"marker", "board"}
 
 
 def conditions(
@@ -801,8 +801,9 @@ def conditions(
     -------
     tuple
         ``per``, else the pipeline's, else the axis of the size in the image, or the first other
-        one with numbers, that of angles, and that of boards, if there are several: what holds of
-        them together holds of none that someone puts up. IDs of markers are no conditions.
+        one with numbers, that of angles, and those of dictionaries and boards, if there are
+        several: what holds of them together holds of none that someone puts up. IDs of markers are
+        no conditions.
     """
     if per is not None:
         return dataset.kept_dimensions(results, per)
@@ -812,10 +813,11 @@ def conditions(
             if name != DRAWS and results.sizes[name] > 1]
     numeric = [name for name in axes if name in results.coords and name not in (IDS, *ANGLE_AXES)
                and results[name].dtype.kind in "fiu"]
-    boards = [name for name in axes if BOARDS in results.coords and results[BOARDS].dims == (name,)]
+    targets = [name for name in axes if results[name].dtype.kind not in "fiu"
+               and not TARGETS.isdisjoint(dataset.sections_of(name, results))]
     usual = [next((name for name in names if name in axes), "") for names in (
-        (*dataset.SIZE_AXES, *SIZES_BESIDE, *numeric), ANGLE_AXES, boards)]
-    return tuple(dict.fromkeys(filter(None, usual)))
+        (*dataset.SIZE_AXES, *SIZES_BESIDE, *numeric), ANGLE_AXES)]
+    return tuple(dict.fromkeys(filter(None, [*usual, *targets])))
 
 
 Decisions = NDArray[np.uint8]

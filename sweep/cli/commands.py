@@ -225,9 +225,13 @@ def _required(pipeline: Pipeline) -> list[str]:
     """Return the requirements, and their conditions."""
     if not pipeline.requirements:
         return []
-    names = ", ".join(_conditions(pipeline))
+    rule, names = pipeline.stopping, _conditions(pipeline)
+    if rule is not None and not names:
+        names = [*rule.at_all, *rule.per]
+    elif not names:
+        names = ["value of the axes of size, angle, dictionaries and boards"]
     return [*pipeline.requirements,
-            f"at each {names}" if names else "pooled over all axes of the scene"]
+            f"at each {', '.join(names)}" if names else "pooled over all axes of the scene"]
 
 
 def _rule_lines(rule: StoppingRule) -> list[str]:
@@ -567,7 +571,7 @@ def require(
     per : --per AXES
         Axes whose values are conditions, at each of which all must hold, such as
         distance_m,tilt_deg; others are pooled, with '' all (default: those of [require], else the
-        axes of size, angle and boards).
+        axes of size, angle, dictionaries and boards).
     pipeline : --pipeline FILE
         Take [require] from this TOML file in place of the store's pipeline.
     at : --at NAME=VALUE,...

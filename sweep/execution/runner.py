@@ -387,7 +387,8 @@ def limit(
         if trials is not None and not (stopped or settings or max_trials):
             lifecycle.open_finished(stored.url)
             limits = requirement_limits(
-                lifecycle.open_dataset(stored.url), require, along, per, at_all)
+                lifecycle.open_dataset(stored.url), require or stored.pipeline.requirements, along,
+                per, at_all)
             return limits.assign_attrs(store=stored.url)
         if store is None and stopped and not settings:
             store = pipeline

@@ -75,7 +75,7 @@ def require(
         Such as "detection >= 0.95" (default: the section [require] of the store's pipeline).
     per
         Axes whose values are conditions, at each of which all must hold; others are pooled
-        (default: those of [require], else the axes of size, angle and boards).
+        (default: those of [require], else the axes of size, angle, dictionaries and boards).
     at
         "name=value": only these values of axes.
     pipeline
@@ -374,7 +374,8 @@ def limit_rows(limits: xr.Dataset) -> list[dict[str, Any]]:
     Returns
     -------
     Beside the variables of the limits: ``condition``; ``reach`` and ``value`` by the estimates;
-    ``met_to``, up to which all is decided to be met; ``decided``, whether that is the limit;
+    ``met_to``, up to which all is decided to be met; ``decided``, whether that is the limit, or the
+    grid's hard end;
     ``text``, such as ``up to 1.2 m``, and ``interval``, whose open ends are the grid's; ``count``,
     at how many values of the axis the requirements are met.
     """
@@ -397,11 +398,11 @@ def limit_rows(limits: xr.Dataset) -> list[dict[str, Any]]:
             Reach.always: f"at all values, {end}",
             Reach.within: f"{place[low]} to {place[high]}{unit}"}.get(reach, end)
         # To one value of the grid, or to the grid's hard end.
-        is_open = reach is not Reach.not_run and not row["settled"] and (
-            reach is not Reach.always or row["value"] != met_to)
+        decided = bool(row["settled"]) or (reach is Reach.always and row["value"] == met_to)
+        is_open = not decided and reach is not Reach.not_run
         where = f" ({row['fails_where']})" if row["fails_where"] else ""
         rows.append({
-            "condition": at, "reach": reach.name, "decided": bool(row["settled"]),
+            "condition": at, "reach": reach.name, "decided": decided,
             "met_to": met_to, **row, "is_open": is_open,
             "text": f"not decided: {text}" if is_open else text,
             "interval": "none" if math.isnan(row["low"]) or math.isnan(row["high"]) else

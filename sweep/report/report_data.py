@@ -48,10 +48,12 @@ Groups = Mapping[str, tuple[float, ...] | None]
 
 
 def bins_of(values: Floats, most: int) -> tuple[float, ...]:
-    """Return edges of bins of values (n,), of about as many each: at most so many, none empty."""
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, most + 1)))
-    edges[-1] = np.nextafter(edges[-1], np.inf)
-    return tuple(edges.tolist())
+    """Return edges of bins of values (n,), of about as many each: at most so many, none empty.
+
+    NaN, of trials that were not run, is left out.
+    """
+    edges = np.unique(np.nanquantile(values, np.linspace(0, 1, most + 1))).tolist()
+    return (*edges[:-1], math.nextafter(edges[-1], math.inf))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -297,7 +299,8 @@ def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
     """Return the configurations of a store, by targets, too, or with them pooled.
 
     If there are more than `MAX_CONFIGURATIONS`, values of the longest axes are chosen, evenly
-    spaced. Of a store with neither settings nor targets to compare, by the values of its effects.
+    spaced. Of a store with neither settings nor targets to compare, by the values of its effects;
+    without effects, by those of what else varies but sizes in the image, angles and IDs.
     """
     if targets in data.compared:
         return data.compared[targets]
@@ -305,9 +308,10 @@ def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
     several = [*(data.pipeline.experiment.target_axes if targets else ()), *settings]
     if targets and not several and not of_photographs(data.results):
         # Nothing else varies on the same draws: the values of an effect, such as noise or JPEG
-        # quality, are compared.
-        several = [axis for axis in data.pipeline.axes if axis.name in data.scene_axes
-                   and not is_grid_axis(axis.name, data.results)]
+        # quality, are compared; else those of a quiet zone, or a lens, whose draws are their own.
+        others = [axis for axis in data.pipeline.axes if axis.name in data.scene_axes
+                  and axis.name not in (*SIZE_AXES, *ANGLE_AXES, IDS)]
+        several = [axis for axis in others if not is_grid_axis(axis.name, data.results)] or others
     counts = {axis.name: len(axis) for axis in several}
     while math.prod(counts.values()) > MAX_CONFIGURATIONS and max(counts.values()) > 2:
         counts[max(counts, key=counts.__getitem__)] -= 1
@@ -489,7 +493,9 @@ class Comparison:
         pair = self.differences[rival]
         shown = [each for each in pair if each.verdict] or [
             next((each for each in pair[2:] if not np.isnan(each.numbers.value)), pair[0])]
-        line = f"{self.name} against {names[rival]}: {'; '.join(map(str, shown))}"
+        # A right one that is better, and was not named, is worse than a third.
+        circle = "None is best: " * (self.verdict(rival) < 0 and not wrong[rival])
+        line = f"{circle}{self.name} against {names[rival]}: {'; '.join(map(str, shown))}"
         counts = Counter(map(self.verdict, others))
         words = ", ".join(f"{word} {counts[verdict]}" for verdict, word in VERDICTS.items()
                           if counts[verdict])
@@ -511,10 +517,9 @@ class Comparison:
             headings.append("verdict")
             cells = [verdicts, *cells, *map(list, zip(*pairs, strict=True))]
             columns += PAIRED
-            few = any(each.column is UNFLIPPED for pair in self.differences for each in pair)
             caption += (
-                f"; differences, ratios and verdict: {self.name} against each, trial by trial"
-                + "; rotation without flips where few poses differ by them" * few)
+                f"; differences and ratios: {self.name} against each, trial by trial; verdict: "
+                "each against it; rotation without flips where few poses differ by them")
         return Table.of(caption, [*headings, *(each.heading for each in columns)],
                         list(zip(known.names, *cells, strict=True)), stub=len(headings))
 
@@ -527,9 +532,9 @@ class Comparison:
 
 
 def verdict_words(differences: Sequence[Difference]) -> str:
-    """Return by what one configuration is better or worse: ``better: detection; worse: range``."""
+    """Return by what the other one is better or worse: ``worse: detection; better: range``."""
     first = overall(differences)
-    parts = [f"{VERDICTS[verdict]}: {', '.join(names)}" for verdict in (first, -first) if (
+    parts = [f"{VERDICTS[-verdict]}: {', '.join(names)}" for verdict in (first, -first) if (
         names := [each.column.heading.split()[0] for each in differences
                   if each.verdict == verdict])]
     return "; ".join(parts) if first else VERDICTS[0]

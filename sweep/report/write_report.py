@@ -16,9 +16,9 @@ import xarray as xr
 
 from sweep import analysis
 from sweep.analysis import requirements as judged
-from sweep.analysis.dataset import of_photographs, sampling_text
+from sweep.analysis.dataset import is_grid_axis, of_photographs, sampling_text
 from sweep.analysis.estimator import Bins
-from sweep.analysis.requirements import BOARDS, Decision, Reached, Verdict, requirement_limits
+from sweep.analysis.requirements import Decision, Reached, Verdict, requirement_limits
 from sweep.analysis.summaries import ThresholdChoice
 from sweep.errors import ArgumentError, DatasetError, StoreError, path_of, texts_of
 from sweep.experiment.parameters import Stage
@@ -224,7 +224,9 @@ def figures_of(data: ReportData) -> list[Figure]:
     """
     made = [figure for make in FIGURES if (figure := make(data)) is not None]
     covered = {name for figure in made for name in figure.covers}
-    drawn = [name for name in data.pipeline.distributions if name in data.results.variables]
+    # Of one draw, or of trials that were not run (NaN), there is nothing along it.
+    drawn = [name for name in data.pipeline.distributions if name in data.results.variables
+             and data.results[name].min() < data.results[name].max()]
     made += [_along(data, name) for name in (*data.scene_axes, *data.setting_axes, *drawn)
              if name not in covered]
     return [figure for figure in made if figure.panels]
@@ -264,8 +266,8 @@ def tables_of(data: ReportData) -> list[Table]:
 
 def board_table(data: ReportData) -> Table:
     """Return the rates of boards' single markers, by board and detector setting."""
-    axes = [data.pipeline.axis_of(BOARDS), *data.pipeline.axes_of(Stage.detection)]
-    dims = [axis.name for axis in axes if axis is not None and len(axis) > 1]
+    axes = (*data.pipeline.experiment.target_axes, *data.pipeline.axes_of(Stage.detection))
+    dims = [axis.name for axis in axes if len(axis) > 1]
     return table_of(
         analysis.detection_rate(analysis.per_marker(data.results), dims),
         "Markers of boards, each counted by itself, with 95 % intervals", dims, RATES,
@@ -351,8 +353,7 @@ class Answer:
         return {
             "answer": self.headline, "text": self.paragraph, "configuration": self.of or None,
             "numbers": self.tiles, **self.numbers,
-            "tables": [table.as_json() for table in (*self.tables, *self.details)],
-        }
+            "tables": [table.as_json() for table in (*self.tables, *self.details)]}
 
 
 def answer(data: ReportData) -> Answer:
@@ -376,14 +377,12 @@ def answer(data: ReportData) -> Answer:
     name = compared.name if len(known.names) > 1 else ""
     line = line or (f"{compared.line}." if compared.line else _in_numbers(tiles))
     if not int(known.summary["looked_for"].sum()):
-        line = (f"The {data.pipeline.target_word} was looked for in no pose: it was visible and "
-                "modelled in none.")
-    warnings = [f"{text.strip()[:1].upper()}{text.strip()[1:]}." for text in data.warnings]
+        line = caption_of("unseen", target=data.pipeline.target_word)
     notes = sentences(
-        *warnings,
-        "A board counts as detected if at least one of its markers is."
-        if data.pipeline.shows_boards else "",
-        caption_of("intervals", photographs=of_photographs(data.results)),
+        *(f"{text.strip()[:1].upper()}{text.strip()[1:]}." for text in data.warnings),
+        caption_of(
+            "notes", photographs=of_photographs(data.results), boards=data.pipeline.shows_boards,
+            own=[name for name in known.axes if is_grid_axis(name, data.results)]),
         report_data.notes_of(data, {}), data.pooled(*known.axes))
     return Answer(
         line, notes, name, tiles, [*first, compared.table()], [*details, *tables_of(data)],
@@ -437,6 +436,10 @@ def required(
     compared = report_data.comparison(data, equal)
     best = compared.best
     whose = f", with {known.names[best]}" if len(known.names) > 1 else ""
+    if data.pipeline.stopping is not None and data.pipeline.stopping.kind == "cheapest":
+        # Costs are measured where they are asked for: the store has none.
+        whose = caption_of("cheapest", met=combined.count(Decision.met), count=len(places),
+                           command=quoted("sweep", "size", data.store))
     line = f"{' and '.join(data.require)}: {_decided(found[best], combined[best])}"
     if limits:
         line += f"; along {along}{_reached(rows[best], others)}"

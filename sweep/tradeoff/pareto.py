@@ -103,12 +103,15 @@ NO_SETTINGS = "as set"
 
 
 def configuration_label(settings: Mapping[str, Any]) -> str:
-    """Return the label of a configuration; words stand alone, other values behind their setting.
+    """Return the label of a configuration; a word stands alone, all else behind its setting.
 
     >>> configuration_label({"cornerRefinementMethod": "subpix", "guarded": True})
     'subpix · guarded True'
+    >>> configuration_label({"exposure": "8, 0.001"})  # a label of parameters that go together
+    'exposure 8, 0.001'
     """
     return " · ".join(
-        value if isinstance(value, str) else f"{name} {value}"
+        value if isinstance(value, str) and value[:1].isalpha() and ", " not in value
+        else f"{name} {value}"
         for name, value in settings.items()
     ) or NO_SETTINGS

@@ -23,8 +23,10 @@ ODD = {
                         "tilt_deg = [0, 60]\ntrial = 3\n",
     "nothing visible": f"{CAMERA}[pose]\ntilt_deg = 180\n[axes]\nside_px = [20, 40]\n",
     "single pose": f"{CAMERA}[pose]\nside_px = 40\n",
-    "a wanted precision": f"{CAMERA}[pose]\njitter_px = 0.5\n[axes]\nside_px = [8, 40]\nsolver = "
-                          '["ippe"]\n[search]\nmax_trials = 100\nprecision.detection_rate = 0.2\n',
+    "a wanted precision": f"{CAMERA}[pose]\ntilt_deg = {{ uniform = [0, 60] }}\n[axes]\n"
+                          'side_px = [8, 40]\nsolver = ["ippe"]\n[search]\nmax_trials = 100\n'
+                          "precision.detection_rate = 0.2\n",
+    "one draw": f"{CAMERA}[pose]\nside_px = 40\ntilt_deg = {{ uniform = [0, 60] }}\n",
     "lists and words": f"{CAMERA}[pose]\nside_px = 40\njitter_px = 0.5\n[axes]\n"
                        'distortion = [[], [-0.1, 0.01, 0, 0]]\nrenderer = ["exact", "warp"]\n'
                        "guarded = [true, false]\ntrial = 3\n",

@@ -87,6 +87,29 @@ def test_line_table_json_and_page_have_the_numbers_of_the_analysis(tmp_path):
             assert (each["value"] > equal) == ((each["verdict"] == "better") == (equal == 0))
 
 
+@pytest.mark.parametrize(("axis", "start"), [
+    ("quiet_zone_modules = [0.5, 1, 2]", "quiet_zone_modules "),
+    ("light = { zip = { white = [200, 255], noise_grey = [8, 2] } }", "light "),
+    ('tag = { zip = { dictionary = ["DICT_4X4_50", "DICT_5X5_50"], marker_id = [7, 9] } }', "tag "),
+])
+def test_what_varies_alone_is_compared_not_averaged(axis, start, tmp_path):
+    url = made(tmp_path, "pose = { side_px = 40, jitter_px = 0.5 }\n[axes]\n"
+               f"{axis}\ntrial = 20\n", "alone")
+    shown, _ = told(url)
+    assert shown["answer"].startswith(start)
+    assert " against " in shown["answer"]
+    assert ("draws of their own" in shown["text"]) == (start != "light ")
+    assert shown["per"] == ([] if start == "light " else [start.strip()])
+
+
+def test_the_cheapest_is_left_to_what_measures_costs(tmp_path):
+    url = made(tmp_path, "pose = { side_px = 40, jitter_px = 0.5 }\n"
+               'require.all = ["detection >= 0.5"]\nsearch = { cheapest = true, max_trials = 20 }\n'
+               "axes.adaptiveThreshConstant = [2, 7]\n", "cheapest")
+    assert told(url)[0]["answer"].endswith(
+        f", by 2 of 2 configurations; the cheapest is named by `sweep size {url}`.")
+
+
 SIZES = {"distance_m": 4, "tilt_deg": 2, "trial": 400, "cornerRefinementMethod": 2}
 
 

@@ -24,22 +24,16 @@ def first(found):
     return found.numbers["causes"][0]["causes"]
 
 
-CENTRE = 0.5 * np.array([[0, 0, 639.5], [0, 0, 359.5], [0, 0, 0]]) / 900
-"""What an image of 640 x 360 px adds to x and y of poses of z, by the calibration of 1280 x 720."""
-
-
 @pytest.mark.parametrize(("mistake", "cause", "size"), [
-    (np.diag([1.0, 1.0, 1.35]), "focal_length", ""), (1.25 * np.eye(3), "size", "(10/8)"),
-    (np.diag([1.0, 1.0, 2.0]) - 2 * CENTRE, "focal_length", "2 times the resolution"),
-    (np.diag([1.0, 1.0, 1000.0]), "units", "tvec_z_m alone longer by 1000"),
-    (1000 * np.eye(3), "units", "size_m, or"), (np.eye(3), "agree", ""),
-    (np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), "axes", "right is -y, down is -z, away is x")])
+    (np.eye(3), "agree", ""), (1.25 * np.eye(3), "size", "(10/8)"),
+    ([[1, 0, -639.5 / 900], [0, 1, -359.5 / 900], [0, 0, 2]], "focal_length", "2 times the res"),
+    (np.diag([1, 1, 1000]), "units", "tvec_z_m alone longer by 1000"),
+    ([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], "axes", "right is -y, down is -z, away is x")])
 def test_causes_are_told_off_the_axis_beside_a_straight_tape(mistake, cause, size):
     truth = np.array([[0, 0.02, 0.5], [0.2, 0, 1], [-0.4, 0.1, 1.5]])
     columns = dict(zip([*TVEC, *MEASURED], [
-        *mistake @ truth.T, *truth.T, np.linalg.norm(truth, axis=1)], strict=True))
-    found = sweep.diagnose(columns, camera=CAMERA, size_m=50 if "size_m" in size else 0.1,
-                           dictionary="DICT_6X6_50")
+        *np.array(mistake) @ truth.T, *truth.T, np.linalg.norm(truth, axis=1)], strict=True))
+    found = sweep.diagnose(columns, camera=CAMERA, size_m=0.1, dictionary="DICT_6X6_50")
     assert (first(found), found.status) == ([cause], 0)
     assert size in found.numbers["causes"][0]["size"]
 
@@ -53,13 +47,14 @@ def test_on_the_axis_they_are_confounded_and_a_row_off_it_would_decide():
     assert "confounded" in found.numbers["sentence"]
 
 
-@pytest.mark.parametrize(("away", "words"), [
-    (AWAY, "nothing is wrong"), (np.linspace(0.5, 2, 100), "nothing is wrong"),
-    (1000 * AWAY, "in metres?")])
-def test_rows_that_agree_are_said_to(away, words):
-    found = sweep.diagnose({"range_m": away * 1.003, "tape_m": away}, camera=CAMERA, size_m=0.1)
-    assert (first(found), found.status) == (["agree"], 0)
-    assert words in found.numbers["sentence"]
+@pytest.mark.parametrize(("said", "tape", "words"), [
+    (1.003 * AWAY, AWAY, "nothing is wrong"), (1003 * AWAY, 1000 * AWAY, "in metres?"),
+    (1.003 * np.linspace(0.5, 2, 100), np.linspace(0.5, 2, 100), "nothing is wrong"),
+    (1e6 * AWAY, AWAY / 3, "No known cause")])
+def test_rows_that_agree_or_that_nothing_explains_are_said_to(said, tape, words):
+    found = sweep.diagnose({"range_m": said, "tape_m": tape}, camera=CAMERA, size_m=0.1)
+    assert (words in found.numbers["sentence"], found.status) == (True, 0)
+    assert (first(found) == ["agree"]) == (words != "No known cause")
 
 
 @pytest.mark.parametrize(("columns", "words"), [
@@ -67,23 +62,14 @@ def test_rows_that_agree_are_said_to(away, words):
     ({"tvec_z_m": [1], "yaw_deg": [20]}, "needs rvec_x or corner0_x_px"),
     ({"range_m": [1.0], "tape_m": ["nan"]}, "row 1, tape_m = nan"),
     ({"range_m": [1.0, ""], "tape_m": [1.0, 2.0]}, "row 2: expected tvec_z_m or range_m"),
-    ({"tvec_z_m": [-1.0]}, "above 0"), ({"rang_m": [1.0]}, "did you mean range_m?"),
-    ({"range_m": [1, 2]}, "same length"),
+    ({"rang_m": [1.0]}, "did you mean range_m?"), ({"range_m": [1, 2]}, "same length"),
     ({"range_m": [1.0], "tape_sd_m": [0.0]}, "tape_sd_m = 0.0: expected a number between"),
-    ({"tape_m": []}, "no rows"), ({"tape_m": [1.0] * 201}, "201 rows"),
+    ({"tape_m": []}, "no rows"), ({"tape_m": [1] * 201}, "201"), ({"tvec_z_m": [-1]}, "above 0"),
 ])
 def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
     with pytest.raises(sweep.ArgumentError, match=re.escape(words)) as error:
         sweep.diagnose({"tape_m": [1.0]} | columns)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(("columns", "words"), [
-    ({"range_m": [1e6, 2e6], "tape_m": [1.0, 2.0]}, "No known cause"),
-    ({"tvec_z_m": [1], "rvec_x": [3.1], "rvec_y": [0], "rvec_z": [0], "yaw_deg": [30]}, "No known"),
-    ({"tvec_x_m": [0.6], "tvec_y_m": [0], "tvec_z_m": [0.8], "tape_m": [1]}, "tvec has right")])
-def test_what_no_cause_explains_is_said(columns, words):
-    assert words in sweep.diagnose(columns).numbers["sentence"]
 
 
 def test_poses_are_solved_from_corners_in_the_cameras_image():
@@ -137,7 +123,6 @@ def test_public_cases_are_ranked_as_their_threads_found_out():
     answers = list(CASES["cases"]())
     known = [(case["found"], [each["causes"] for each in found.numbers["causes"]])
              for case, found in answers if case["found"]]
-    assert len(answers) >= 12
     assert sum([found] == causes[0] for found, causes in known) >= 0.7 * len(known)
     assert sum([found] in causes[:2] for found, causes in known) >= 0.9 * len(known)
     guide = (FOLDER / "README.md").read_text()

@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 
 from sweep.analysis.estimator import clopper_pearson
-from sweep.diagnosis.inference import (
-    CAUSES,
-    CLEAR_ODDS,
-    FLIPS,
-    STRAIGHT,
-    rank,
-    rivals,
-    size_ratios,
-)
+from sweep.diagnosis.inference import CAUSES, CLEAR_ODDS, FLIPS, STRAIGHT, rank, rivals, size_ratios
 from sweep.diagnosis.observations import REFINEMENTS, Observations
 from sweep.model.calibration import Calibration
 

@@ -1110,22 +1110,20 @@ def in_bins(columns: Arrays, edges: Edges, design: Design) -> Iterator[Arrays]:
     Cells without a pose inside are left out, and trials: each cell has its own, those with a pose
     inside first. Replicates count in any case, and photographs keep their places.
     """
-    if not edges:
-        yield columns
-        return
     # Of values at the last edge and beyond, and of NaN, it is the number of bins.
-    numbers = [np.searchsorted(each, columns.pop(f"{PREFIX}{name}"), side="right") - 1
-               for name, each in edges.items()]
+    numbers = [np.searchsorted(each, columns.pop(f"{PREFIX}{name}"), side="right").astype(np.int32)
+               - 1 for name, each in edges.items()]
     for index in np.ndindex(*(len(each) - 1 for each in edges.values())):
         inside = np.logical_and.reduce([a == b for a, b in zip(numbers, index, strict=True)])
-        cells = inside.any(axis=(0, 2, 3))
+        cells, = inside.any(axis=(0, 2, 3)).nonzero()
         seen = inside[:, cells].any(axis=3) | (design.unit != "trial")
-        draws = np.argsort(~seen, axis=2, kind="stable")[..., : seen.sum(axis=2).max(initial=1)]
-        part = {**columns, INSIDE: inside}
+        draws = np.argsort(~seen, axis=2, kind="stable")[
+            ..., : seen.sum(axis=2).max(initial=1)].astype(np.int32)
+        part, at = {**columns, INSIDE: inside}, np.arange(len(draws))[:, None, None]
         # In memory the draws stay side by side, as `_column` arranges them.
-        yield part if draws.size == inside[..., 0].size else {name: np.moveaxis(np.take_along_axis(
-            np.moveaxis(each[:, cells], 2, -1), np.expand_dims(draws, (*range(2, each.ndim - 1),)),
-            axis=-1), -1, 2) for name, each in part.items()}
+        yield part if draws.size == inside[..., 0].size else {name: np.moveaxis(np.moveaxis(
+            each, (0, 1, 2), (-3, -2, -1))[..., at, cells[:, None], draws].copy(), (-3, -2, -1),
+            (0, 1, 2)) for name, each in part.items()}
 
 
 def bin_coordinates(results: xr.Dataset, edges: Edges) -> dict[str, Any]:
@@ -1182,7 +1180,7 @@ def aggregates(
     columns, design = arranged(results, {**inputs, **binned}, kept, stopped=stopped)
     statistics = [*itertools.chain(*sets)]
     found: list[list[NDArray[Any]]] = []  # (bins, outputs, groups, ...)
-    for part in in_bins(columns, edges, design):
+    for part in in_bins(columns, edges, design) if edges else [columns]:
         groups, *rest = next(iter(part.values())).shape[:4]
         step = max(MAX_SHARED // max(math.prod(rest), 1), 1)  # groups at a time
         # One at a time: each keeps what it has computed of its poses.
@@ -1191,6 +1189,7 @@ def aggregates(
         found.append([np.concatenate(arrays) for arrays in zip(*(
             [array for statistic in statistics for array in statistic.arrays(block, design)]
             for block in blocks), strict=True)])
+        del part  # before the next is made
     shape = (*(results.sizes[name] for name in kept), *(len(each) - 1 for each in edges.values()))
     coordinates = {name: value.variable for name, value in results.coords.items()
                    if set(value.dims) <= set(kept) and not dataset.is_fixed(value)}

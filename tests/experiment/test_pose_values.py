@@ -1,6 +1,5 @@
 """Ways of giving a pose: each against SciPy's Rotation and closed forms, and all against draws."""
 
-
 import cv2
 import numpy as np
 import pytest

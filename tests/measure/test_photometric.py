@@ -23,7 +23,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Estimates
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.measure.likelihood import MAX_SHIFT, MAX_TURN, POSITION, moved_state, state_of
-from sweep.measure.photometric import Photometric
+from sweep.measure.photometric import Photometric, start_states
 from sweep.model.board import single_marker
 from sweep.model.scene import Targets
 
@@ -63,6 +63,12 @@ def test_a_step_turns_and_shifts_a_pose_no_farther_than_its_limits(k):
     turn = math.acos((moved[:9] @ np.eye(3).ravel() - 1.0) / 2.0)
     np.testing.assert_allclose([turn, shift], [MAX_TURN, 0] if k < 3 else [0, MAX_SHIFT],
                                atol=1e-7)
+
+
+def test_a_fit_starts_at_the_middle_of_a_target():
+    turn = np.array([[[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]])  # x becomes y, and y x
+    (start,) = start_states((turn, np.array([[1.0, 2, 3]])), np.array([0.1, 0.2, 0]), 1.0)
+    assert start[POSITION] == pytest.approx([1.2, 2.1, 3])
 
 
 class Cell:

@@ -1,6 +1,5 @@
 """The images of every renderer, against polygon clipping and dense sampling written anew here."""
 
-
 import cv2
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from support.exact_image import (
 )
 from support.lengths import lengths
 from sweep.model.exposure import marker_boxes
-from sweep.model.renderers import marker_levels, render
+from sweep.model.renderers import beside_pixels, marker_levels, render
 from sweep.model.scene import build_scenes
 
 # Scenes, and the images of the renderers under test.
@@ -71,6 +70,8 @@ def worst_difference(value):
     """Largest difference from clipping over all pixels of the frame, in units of a pixel."""
     expected, found = np.array(clipped_image(value)), levels_of(value)
     assert np.isfinite(found).all()
+    box = 0, 0, value["width_px"], value["height_px"]
+    assert beside_pixels(scene_of(value)[0], 0, box).shape == found.shape[1:]
     assert expected[1].max() > 0
     return (np.abs(expected - found).max(axis=(1, 2)) / [255, 1]).max()
 

@@ -1,6 +1,5 @@
 """Lenses, bent sheets, printed sizes, shifted images: against rays and sums written here."""
 
-
 import numpy as np
 import pytest
 

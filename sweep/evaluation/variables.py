@@ -18,7 +18,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.schema import BOARD_SCHEMA, PHOTOGRAPH_SCHEMA, SCHEMA
 from sweep.measure import estimation
 from sweep.measure.classify import TargetScenes
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import Ambiguous, DetectionStatus, EstimateStatus, Flipped
 from sweep.measure.likelihood import Bounds
 from sweep.model.exposure import areas_px
 from sweep.model.polygon import signed_areas
@@ -184,6 +184,7 @@ ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
     "residual_variance_ratio": lambda results: results.estimates.residual_ratio,
     "misfit_px": lambda results: results.estimates.misfit_px,
     "flipped": _flipped,
+    "ambiguous": lambda results: results.estimates.ambiguous,
     "point_count": lambda results: results.estimates.point_count,
 }
 
@@ -193,6 +194,7 @@ ALL = slice(None)
 #: Flag variable of the estimation -> its flag for scenes without a detection.
 WITHOUT_DETECTION: dict[str, int] = {
     "estimate": EstimateStatus.no_detection, "flipped": Flipped.no_estimate,
+    "ambiguous": Ambiguous.not_judged,
 }
 
 

@@ -29,7 +29,7 @@ from sweep.experiment.sampling import MAX_TRIALS, StoppingRule, read_required, r
 from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.measure.detectors import OPENCV
 from sweep.measure.estimators import SOLVERS
-from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import Ambiguous, BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal, shown
 from sweep.model import marker
 from sweep.model.board_kinds import ARRANGING, NEEDED, SINGLE, arrangement_faults, is_solid, used_by
@@ -451,7 +451,7 @@ def something_random_to_repeat(reading: Reading) -> None:
 #: Names in datasets and tables that no axis may take.
 RESERVED = {
     *VARIABLES, *LABELS, *HEADER, *parameters.SECTIONS, "axes", TRIAL,
-    *(flag.name for flags in (BoundStatus, DetectionStatus, EstimateStatus, Flipped)
+    *(flag.name for flags in (Ambiguous, BoundStatus, DetectionStatus, EstimateStatus, Flipped)
       for flag in flags),
     "block", "commits", "compared", "cost", "count", "draws", "image_x_px", "image_y_px",
     "jitter_u_px", "jitter_v_px", "level", "looked_for", "outcome", "share", "treatment",

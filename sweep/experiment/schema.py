@@ -387,6 +387,8 @@ SCHEMA: tuple[Variable, ...] = (
              "residuals of photometric_real show", "px", present_when=_MAYBE_POSE),
     Variable("flipped", _E, "u1", "whether the solution is nearer to the mirror of the truth",
              flags=flags.Flipped),
+    Variable("ambiguous", _E, "u1", "whether another pose explains the pixels about as well",
+             flags=flags.Ambiguous),
 )
 
 #: The variables that stores of boards have besides; those of :data:`NOT_OF_BOARDS` they lack.

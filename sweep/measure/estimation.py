@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.measure.flags import EstimateStatus
+from sweep.measure.flags import Ambiguous, EstimateStatus
 from sweep.measure.surroundings import BoardMarker
 from sweep.model.camera import Cameras
 from sweep.model.coverage import POSE, velocity
@@ -148,6 +148,8 @@ class Estimates:
     ----------
     status
         (N,) :class:`sweep.measure.flags.EstimateStatus`.
+    ambiguous
+        (N,) :class:`sweep.measure.flags.Ambiguous`.
     rotation, translation
         (N, 3, 3), and (N, 3) in metres.
     reprojection_px
@@ -166,6 +168,7 @@ class Estimates:
     """
 
     status: NDArray[np.uint8]
+    ambiguous: NDArray[np.uint8]
     rotation: Floats
     translation: Floats
     reprojection_px: Floats
@@ -182,6 +185,7 @@ class Estimates:
         shapes = ((3, 3), (3,), (), (3, 3), (), (6, 6), (), (), ())
         return Estimates(
             np.full(count, status, dtype=np.uint8),
+            np.full(count, Ambiguous.not_judged, dtype=np.uint8),
             *(np.full((count, *shape), np.nan) for shape in shapes),
         )
 

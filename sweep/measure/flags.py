@@ -173,6 +173,16 @@ class Flipped(Flag):
     not_needed = flag(4, "The precision that was asked for did not need the trial.", counted=False)
 
 
+class Ambiguous(Flag):
+    """Whether another pose explains the pixels about as well; ``photometric_real`` judges it."""
+
+    not_run = flag(0, "The estimate was not computed.", counted=False)
+    clear = flag(1, "The pixels rule other poses out.", present=True)
+    ambiguous = flag(2, "Another pose explains the pixels about as well.", present=True)
+    not_judged = flag(3, "There is no pose, or the solver does not judge it.", counted=False)
+    not_needed = flag(4, "The precision that was asked for did not need the trial.", counted=False)
+
+
 def present_values(flags: Iterable[Flag]) -> list[int]:
     """Return the values of the flags beside which the stage's numbers exist.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from sweep.compilation import compiled, compiled_inline
@@ -198,8 +199,6 @@ def add_plane(
     shortest
         Least length of a panel of the quadrature in px.
     """
-    intrinsics = projection.optics.intrinsics
-    shift_x, shift_y = intrinsics[2] + 0.5, intrinsics[3] + 0.5
     ends, sides, flat = edges.ends, edges.sides, polygon.flat_sheet()
     for e in range(ends.shape[0]):
         jump = values[sides[e, 1]] - values[sides[e, 0]]
@@ -207,20 +206,11 @@ def add_plane(
         if jump == 0.0 and outside == 0.0:
             continue
         edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
-        if not projection.optics.distorted:
-            x0, y0, z0 = polygon.homogeneous_pixel(
-                projection, shift_x, shift_y, edge.column, edge.row
-            )
-            x1, y1, z1 = polygon.homogeneous_pixel(
-                projection, shift_x, shift_y, edge.to_column, edge.to_row
-            )
-            _add_segment(
-                out, jump, outside, sigma, shortest, x0 / z0, y0 / z0, x1 / z1, y1 / z1
-            )
-            continue
         x, y = polygon.edge_pixel(0.0, edge, projection, flat)
         u, v = polygon.edge_pixel(1.0, edge, projection, flat)
-        chords = polygon.chord_count(edge, 0, 1, (x, y, u, v), projection, flat)
+        chords = 1
+        if projection.optics.distorted:
+            chords = polygon.chord_count(edge, 0, 1, (x, y, u, v), projection, flat)
         for chord in range(1, chords + 1):
             u, v = polygon.edge_pixel(chord / chords, edge, projection, flat)
             _add_segment(
@@ -306,12 +296,6 @@ def rays_of(optics: Optics, height: int, width: int) -> Floats:
     """Return the rays (6, height, width) of a box, as :class:`PhotographView` has them."""
     rays = np.empty((6, height, width))
     fx, fy, cx, cy = optics.intrinsics
-    if not optics.distorted:
-        for i in range(height):
-            for j in range(width):
-                rays[0, i, j], rays[1, i, j] = (j - cx) / fx, (i - cy) / fy
-                rays[2, i, j], rays[3, i, j], rays[4, i, j], rays[5, i, j] = fx, 0.0, 0.0, fy
-        return rays
     rows = (height - 1) // LENS_STEP_PX + 2
     columns = (width - 1) // LENS_STEP_PX + 2
     lattice = np.empty((6, rows, columns))
@@ -329,9 +313,7 @@ def rays_of(optics: Optics, height: int, width: int) -> Floats:
         for i in range(height):
             row, down = i // LENS_STEP_PX, (i % LENS_STEP_PX) / LENS_STEP_PX
             for j in range(columns):
-                blended[j] = (
-                    lattice[k, row, j] * (1.0 - down) + lattice[k, row + 1, j] * down
-                )
+                blended[j] = lattice[k, row, j] * (1.0 - down) + lattice[k, row + 1, j] * down
             for j in range(width):
                 column, right = j // LENS_STEP_PX, (j % LENS_STEP_PX) / LENS_STEP_PX
                 rays[k, i, j] = blended[column] * (1.0 - right) + blended[column + 1] * right
@@ -559,12 +541,12 @@ def photograph_view(
         Whether the tone curve is estimated.
     """
     modules = module_count(marker.dictionary)
-    with np.errstate(invalid="ignore", divide="ignore"):  # three corners on a line
-        square = from_unit_square(corners[None])[0]
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
+    square = cv2.getPerspectiveTransform(unit, corners.astype(np.float32))
     side = 0.25 * sum(math.dist(corners[k - 1], corners[k]) for k in range(4))
     ring = ring_modules(marker, on_board)
     if not np.isfinite(square).all() or np.linalg.det(square) == 0.0:
-        return None
+        return None  # three corners on a line
     to_pixels = square / [modules, modules, 1.0]
     to_modules = np.asarray(np.linalg.inv(to_pixels), dtype=np.float64)
     low_end, high_end = -ring, modules + ring
@@ -606,26 +588,6 @@ def photograph_view(
     return PhotographView(
         known, levels, spans, rays_of(optics, height, width), at, PANEL_PX, toned
     )
-
-
-def from_unit_square(quads: Floats) -> Floats:
-    """Return the homographies (P, 3, 3) of the unit square to quadrilaterals (P, 4, 2).
-
-    (0, 0), (1, 0), (1, 1), (0, 1) become the corners in their order. From Heckbert, "Fundamentals
-    of texture mapping and image warping" (1989), section 2.2.3.
-    """
-    p0, p1, p2, p3 = (quads[:, k] for k in range(4))
-    d1, d2, total = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
-
-    def cross(a: Floats, b: Floats) -> Floats:
-        return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-    area = cross(d1, d2)
-    g, h = (cross(total, d2) / area)[:, None], (cross(d1, total) / area)[:, None]
-    out = np.ones((len(quads), 3, 3))
-    out[:, :2, 0], out[:, :2, 1], out[:, :2, 2] = p1 - p0 + g * p1, p3 - p0 + h * p3, p0
-    out[:, 2, :2] = np.column_stack([g, h])
-    return out
 
 
 @compiled
@@ -964,8 +926,11 @@ def _write_residuals(
 # The pose in a photograph: the best minimum of several starts, and its covariance.
 
 #: Of photographs. The last step is taken: near the minimum the one after it is a hundredth as long.
-#: Fits of all pixels chose the mirror at an excess of at most 44.
-REAL = likelihood.Search(4.0, 16.0, 50.0)
+#: At an excess of 50 coarse fits ruled a mirror out that was right, one of 521; at 100 none.
+REAL = likelihood.Search(4.0, 16.0, 100.0)
+
+#: Turn between two minima, in radians, below which it does not matter which is right.
+SAME_POSE_RAD = math.radians(5.0)
 
 
 @compiled
@@ -980,10 +945,59 @@ def locate_photograph(
     freedom = pixel_count(view) - SIZE
     coarse = binned_photograph(view)
     work = system(view.levels.shape[0], view.levels.shape[1])
+    unused = np.empty((MOVED, MOVED))
     state, level, reached, other = likelihood.locate(
         view, work, freedom, coarse,
-        system(coarse.levels.shape[0], coarse.levels.shape[1]), starts, REAL,
-        np.empty((MOVED, MOVED)),
+        system(coarse.levels.shape[0], coarse.levels.shape[1]), starts, REAL, unused,
     )
+    if likelihood.turn_between(state, other) > SAME_POSE_RAD:
+        # The search ends where a minimum cannot be the best, which may be far from it.
+        likelihood.descend(
+            view, other, work, freedom, likelihood.COARSE_STEPS, 1.0, math.inf, unused
+        )
     misfit = judge(view, state, work, covariance) if reached else math.nan
     return state, level, reached, other, freedom, misfit
+
+
+# --------------------------------------------------------------------------------------------------
+# Which of two minima is the pose.
+#
+# With r the residuals at the pose and d the difference of both images, the squared residuals at the
+# other minimum are larger by T = sum d (2 r + d). If the pose is right, T has the mean dᵀd and the
+# variance 4 dᵀCd, with C the covariance of the residuals; if the other one is, the mean -dᵀd. The
+# logarithm of their likelihoods' ratio is T / (2 dᵀCd / dᵀd): noise of variance v alone has
+# T / (2 v). Along d residuals of photographs are larger and correlated: the images differ at edges,
+# where shifts, tone and compression leave the most. So dᵀCd is that of the residuals themselves,
+# the sum of products of d r of pixels by their distance, with Bartlett's weights (Newey and West,
+# "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance
+# matrix", Econometrica 55, 1987): a mean over squares of squared sums.
+
+#: Side of the squares over that of the fitted area: shifts are correlated about as far.
+CORRELATED_SHARE = 0.3
+
+
+def log_odds(view: PhotographView, state: Floats, other: Floats) -> float:
+    """Return the logarithm of the odds of a fitted state (18,) against another one.
+
+    Infinite if there is no other one, or if its pose is the same to :data:`SAME_POSE_RAD`.
+    """
+    if not likelihood.turn_between(state, other) > SAME_POSE_RAD:
+        return math.inf
+    work = system(*view.levels.shape)
+    information, gradient = np.empty((MOVED, MOVED)), np.empty(MOVED)
+    images = []
+    for fitted in (state.copy(), other.copy()):
+        likelihood.squared_residuals(view, fitted, work, information, gradient)
+        draw(view, fitted, work)
+        share = work.images[0] + fitted[TONE] * work.images[1]
+        images.append(fitted[BLACK] + (fitted[WHITE] - fitted[BLACK]) * share)
+    columns = np.arange(view.levels.shape[1])
+    used = (view.spans[:, :1] <= columns) & (columns < view.spans[:, 1:])
+    residual = (view.levels - images[0]) * used
+    change = (images[0] - images[1]) * used
+    side = math.ceil(CORRELATED_SHARE * math.sqrt(used.sum()))
+    sums = np.pad(residual * change, side).cumsum(axis=0).cumsum(axis=1)
+    sums = sums[side:] - sums[:-side]
+    sums = sums[:, side:] - sums[:, :-side]
+    spread = (sums**2).sum() / side**2 / (change**2).sum()
+    return float((change * (2.0 * residual + change)).sum() / (2.0 * spread))

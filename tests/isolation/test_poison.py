@@ -14,7 +14,7 @@ from support.stores import by_hand
 from sweep.execution.status import status
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline, selection_text
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import Ambiguous, DetectionStatus, EstimateStatus, Flipped
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store
 
@@ -49,7 +49,7 @@ def expected(reference, pipeline, poisons):
         flags = {
             "detection": DetectionStatus.crashed if poison.deadly else DetectionStatus.failed,
             "estimate": EstimateStatus.no_detection,
-            "flipped": Flipped.no_estimate,
+            "flipped": Flipped.no_estimate, "ambiguous": Ambiguous.not_judged,
             "bound": 0,
         }
         if first is Stage.estimation:

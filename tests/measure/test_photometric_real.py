@@ -14,7 +14,7 @@ from support.board_scenes import BoardPose, board_scene, levels_of
 from support.lengths import first_of
 from support.solving import of_markers
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.flags import EstimateStatus
+from sweep.measure.flags import Ambiguous, EstimateStatus
 from sweep.measure.likelihood import state_of
 from sweep.measure.photograph import HELD, SIZE, _write_cell, draw, photograph_view, system
 from sweep.measure.photometric import PhotometricReal
@@ -252,6 +252,24 @@ def test_the_bound_is_attained_with_levels_and_blur(claim):
     claim("RMSE of solver photometric_real over the accuracy bound, less 1",
           "the bound of the exact image's derivatives", np.abs(ratio - 1).max())
     assert np.abs(ratio - 1).max() < 0.2
+
+
+def test_a_pose_is_ambiguous_where_noise_may_bring_the_mirror_about():
+    """A flip with odds of 1e5 has a probability below 1e-6, as a mirror at 15 deviations has."""
+    pipeline = Pipeline.from_dict({
+        "camera": {"width_px": 160, "height_px": 120, "fx_px": 600},
+        "pose": {"side_px": {"uniform": [14, 34]}, "tilt_deg": {"uniform": [10, 50]}},
+        "scene": {"bound": "unknown_blur", "blur_px": 0.7, "black": 60, "white": 180,
+                  "background": 180},
+        "estimator": {"solver": "photometric_real"}, "axes": {"noise_grey": [2, 12], "trial": 200},
+    })
+    columns = run_cells(pipeline, list(np.divmod(np.arange(400), 200))).columns
+    wrong, far = columns["rotation_error_deg"][0] > 10, columns["mirror_distance"][0] > 15
+    ambiguous = columns["ambiguous"][0]
+    assert wrong.sum() > 1
+    assert far.sum() > 50
+    assert (ambiguous[wrong] == Ambiguous.ambiguous).all()
+    assert (ambiguous[far] == Ambiguous.ambiguous).mean() < 0.02
 
 
 @pytest.mark.long

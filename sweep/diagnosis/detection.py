@@ -187,8 +187,8 @@ def error_model(
     Raises
     ------
     StoreError, DatasetError
-        If there is no store, fewer than 2,000 solved poses that differ, are not flipped and have
-        two solutions, or 50 of photographs, several settings, focal lengths or sizes.
+        If there is no store, fewer than 2,000 solved poses, of which half differ, are not flipped
+        and have two solutions, or 50 of photographs, several settings, focal lengths or sizes.
 
     Examples
     --------
@@ -258,10 +258,10 @@ def of_simulation(results: xr.Dataset) -> DetectionModel:
     """Return the model of a simulation's poses."""
     errors, rvec, tvec, ratio, flipped, _ = estimated(results)
     count = min(len(np.unique(errors[~flipped], axis=0)), int((ratio > 0).sum()))
-    if count < MIN_POSES:
-        raise DatasetError(f"{count:,} solved poses that are not flipped, differ and have two "
-                           f"solutions; a model of one detection needs {MIN_POSES:,} or more: "
-                           "more trials, noise, or solver ippe")
+    if len(tvec) < MIN_POSES or count < MIN_POSES / 2:
+        raise DatasetError(f"{len(tvec):,} solved poses, of which {count:,} are not flipped, "
+                           "differ and have two solutions; a model of one detection needs "
+                           f"{MIN_POSES:,}, and half of that: more trials, noise, or solver ippe")
     focal_sizes = focal_size_of(results)
     focal_size = float(focal_sizes.mean())
     if not np.allclose(focal_sizes, focal_size, rtol=1e-3):

@@ -256,7 +256,7 @@ def _run_batch(
             number = k * len(builds) + j
             for name, flag in variables.WITHOUT_DETECTION.items():
                 columns[name][number, need[:, k, j]] = flag
-            compared = variables.compared(poses, batch.scenes, rows)
+            compared = variables.compared(poses, batch, rows)
             variables.write(columns, variables.ESTIMATION, compared, number, rows)
             result.seconds["estimation"][number] += time.perf_counter() - start
     result.failures += [

@@ -45,20 +45,27 @@ class EstimationResults:
         The estimator's poses, and their errors: n of each.
     true_rotation
         (n, 3, 3) target to camera.
+    covariance
+        (n, 6, 6) expected of the errors: the estimates', plus that of a photograph's truth.
     """
 
     estimates: estimation.Estimates
     error: estimation.PoseError
     true_rotation: Floats
+    covariance: Floats
 
 
 def compared(
-    estimates: estimation.Estimates, scenes: Scenes, rows: NDArray[np.intp]
+    estimates: estimation.Estimates, batch: SceneBatch, rows: NDArray[np.intp]
 ) -> EstimationResults:
     """Return the estimates (n,) of the scenes ``rows`` beside the truth and their errors."""
-    rotation, translation = scenes.rotation[rows], scenes.translation[rows]
+    rotation, translation = batch.scenes.rotation[rows], batch.scenes.translation[rows]
     error = estimation.pose_error(estimates.rotation, estimates.translation, rotation, translation)
-    return EstimationResults(estimates, error, rotation)
+    covariance = estimates.covariance
+    if "truth_std" in batch.values and "neighbourhood" not in batch.values:  # no exact twins
+        std = np.nan_to_num(batch.values["truth_std"].values[rows]).astype(np.float64)
+        covariance = covariance + std[:, None] ** 2 * np.eye(std.shape[1])
+    return EstimationResults(estimates, error, rotation, covariance)
 
 
 def target_areas_px(scenes: Scenes, targets: TargetScenes) -> Floats:
@@ -179,8 +186,7 @@ ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
         np.diagonal(results.estimates.covariance, axis1=1, axis2=2)
     ),
     "nees": lambda results: estimation.squared_deviations(
-        results.error.rotation_rad, results.error.translation_m, results.estimates.covariance
-    ),
+        results.error.rotation_rad, results.error.translation_m, results.covariance),
     "residual_variance_ratio": lambda results: results.estimates.residual_ratio,
     "misfit_px": lambda results: results.estimates.misfit_px,
     "flipped": _flipped,

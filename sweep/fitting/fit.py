@@ -881,9 +881,6 @@ def in_words(one: Estimate) -> str:
 # --------------------------------------------------------------------------------------------------
 # From a folder of photographs to a fitted scene and its file.
 
-#: Settings of the markers in the photographs; others set the comparison.
-OF_MARKERS = ("dictionary", "size_m")
-
 #: Detector settings that the check compares unless others are given.
 COMPARED = 'cornerRefinementMethod=["none", "subpix"]'
 
@@ -954,7 +951,7 @@ def fit(
     """
     if markers not in range(1, 1001):
         raise ArgumentError("markers", markers, "expected a whole number from 1 to 1000")
-    if all(prepare.setting_name(each) in OF_MARKERS for each in settings):
+    if all(prepare.setting_name(each) in ("dictionary", "size_m") for each in settings):
         settings = [*settings, COMPARED]
     with tempfile.TemporaryDirectory() as written:
         home = Path(written).resolve()

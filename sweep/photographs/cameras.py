@@ -426,8 +426,7 @@ def _rms_fault(rms_px: float, size: tuple[int, int]) -> str:
     limit = MAX_RMS_PX * max(1.0, size[0] / 800)
     return "" if not rms_px > limit else (
         f"corners are {rms_px:.2g} px RMS beside the camera; expected at most {limit:.2g} px: "
-        "check the board's kind, that the print is flat, and that all photographs are of this "
-        "camera at one focus"
+        "check the board's kind, that it is flat, and that all photographs are of one camera"
     )
 
 

@@ -316,10 +316,8 @@ def check_board(
         if len(one.ids) >= MIN_JUDGED and fitting_share(board, [one]) < MIN_OWN
     ]
     if twice + once >= MIN_JUDGED and twice > once:
-        raise fault_of(
-            folder, "most markers are in an image twice: of two cameras side by side give the "
-            "calibration (--stereo FILE), of two equal boards show one",
-        )
+        raise fault_of(folder, "most markers are in an image twice: of two cameras side by side "
+                       "give the calibration (--stereo FILE), of two equal boards show one")
     if not ids:
         fault = _no_marker(board, find, photographs[:MAX_TRIED])
     elif ids.isdisjoint(board.marker_ids):

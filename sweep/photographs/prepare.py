@@ -205,13 +205,11 @@ def prepare(
     elif rig is None:
         own_poses(one)
     else:
-        back = rig.rotation.T
         partner_poses(one, others[0], rig.rotation, rig.translation)
-        partner_poses(others[0], one, back, -back @ rig.translation)
+        partner_poses(others[0], one, rig.rotation.T, -rig.rotation.T @ rig.translation)
         if sizes and any(not each.record.shown.any() or _misplaced(each) for each in sides):
-            raise ArgumentError("stereo", plain(stereo), (
-                "most markers are not where the other camera has them; expected R and T, in "
-                "metres, from the left camera's frame to the right one's"))
+            raise ArgumentError("stereo", plain(stereo), "most markers are not where the other "
+                                "camera has them; expected R and T, in metres, from left to right")
     sides = sides[:1] if one_camera else sides
     lines += _summary(sides, dictionary)
     name = name or name_of(Path(folders[0]))
@@ -340,9 +338,8 @@ def _summary(sides: Sequence[Side], dictionary: str) -> list[str]:
             f"{100 * np.nanmedian(std[:, 5] / translation[:, 2]):.2g} % of the range"
         )
     what = "photographs" if len(records) == 1 else "pairs of photographs"
-    near, far = translation[:, 2].min(), translation[:, 2].max()
-    found = f"{int(shown.sum()):,} markers, {near:.3g} to {far:.3g} m away, in {count:,} {what}"
-    return [*lines, f"{found}; truth: {source}{spread}"]
+    away = f"{translation[:, 2].min():.3g} to {translation[:, 2].max():.3g} m away"
+    return [*lines, f"{shown.sum():,} markers, {away}, in {count} {what}; truth: {source}{spread}"]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -453,8 +450,9 @@ def poses_of_file(side: Side, path: Path) -> list[str]:
     if unknown := sorted({*answers.marker_id[marker < 0].tolist()}):
         faults.append(f"markers {shown(unknown)}: expected those of the board, or of the "
                       f"dictionary in the photographs: {shown(record.marker_id.tolist())}")
-    if not np.isfinite(answers.translation).all() or not np.isfinite(answers.rotation).all():
-        faults.append("expected a pose in each row: rx, ry, rz, tx, ty, tz")
+    poses = answers.translation.sum(axis=1) + answers.rotation.sum(axis=(1, 2))
+    if not len(poses) or not np.isfinite(poses).all():
+        faults.append("expected rows, and a pose in each: rx, ry, rz, tx, ty, tz")
     if not faults:
         side.put((answers.image, marker), answers.rotation, answers.translation,
                  TruthSource.poses_file)
@@ -462,9 +460,8 @@ def poses_of_file(side: Side, path: Path) -> list[str]:
         if ratio is not None:
             faults.append(
                 "most markers are not where its poses have them, with positions that are "
-                f"{ratio:.3g} times those of the detected markers; expected metres, the marker's "
-                "true size, and rotation vectors and positions from the marker's frame (x right, "
-                "y up) to the camera's (x right, y down, z forward)"
+                f"{ratio:.3g} times those of the detected markers; expected metres, and poses from "
+                "the marker's frame (x right, y up) to the camera's (x right, y down, z forward)"
             )
     if faults:
         raise refusal([f"{plain(path)}: {fault}" for fault in faults])

@@ -33,11 +33,11 @@ from quadrilaterals import (
     Surround,
     Thresholds,
     candidates,
+    from_unit_square,
     transformed,
 )
 
 from sweep.measure.detectors import DetectorSetting
-from sweep.measure.photograph import from_unit_square
 from sweep.model.marker import opencv_dictionary
 from sweep.typing import Floats
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.measure.photograph import from_unit_square
 from sweep.model.exposure import WARP_PX_PER_MODULE
 from sweep.model.polygon import side_lengths
 from sweep.typing import Floats
@@ -36,6 +35,26 @@ HOLLOW = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])
 or more has a middle that a window of 3 px sees no white in, and does not take for black. The
 outline of that hole has its corners cut off by a pixel, and of each cut one end becomes a corner:
 the quadrilateral is turned by a pixel."""
+
+
+def from_unit_square(quads: Floats) -> Floats:
+    """Return the homographies (P, 3, 3) of the unit square to quadrilaterals (P, 4, 2).
+
+    (0, 0), (1, 0), (1, 1), (0, 1) become the corners in their order. From Heckbert, "Fundamentals
+    of texture mapping and image warping" (1989), section 2.2.3.
+    """
+    p0, p1, p2, p3 = (quads[:, k] for k in range(4))
+    d1, d2, total = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
+
+    def cross(a: Floats, b: Floats) -> Floats:
+        return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+    area = cross(d1, d2)
+    g, h = (cross(total, d2) / area)[:, None], (cross(d1, total) / area)[:, None]
+    out = np.ones((len(quads), 3, 3))
+    out[:, :2, 0], out[:, :2, 1], out[:, :2, 2] = p1 - p0 + g * p1, p3 - p0 + h * p3, p0
+    out[:, 2, :2] = np.column_stack([g, h])
+    return out
 
 
 @dataclass(frozen=True, slots=True)

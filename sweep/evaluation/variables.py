@@ -121,8 +121,7 @@ GEOMETRY: dict[str, Callable[[Scenes], NDArray[Any]]] = {
     "true_rvec": lambda scenes: vector_of_rotation(scenes.rotation),
     "true_tvec_m": lambda scenes: scenes.translation,
     "viewing_angle_deg": lambda scenes: np.degrees(
-        viewing_angle(scenes.rotation, scenes.translation)
-    ),
+        viewing_angle(scenes.rotation, scenes.translation)),
 }
 
 
@@ -132,9 +131,7 @@ def _centre_px(scenes: Scenes) -> Floats:
 
 #: Variable of photographs, whose poses are not drawn but found -> its values (N,).
 OF_PHOTOGRAPHS: dict[str, Callable[[Scenes], NDArray[Any]]] = {
-    "side_px": lambda scenes: (
-        scenes.cameras.view[:, 0] * scenes.size_m / scenes.translation[:, 2]
-    ),
+    "side_px": lambda scenes: scenes.cameras.view[:, 0] * scenes.size_m / scenes.translation[:, 2],
     "distance_m": lambda scenes: scenes.translation[:, 2],
     "image_x_px": lambda scenes: _centre_px(scenes)[:, 0],
     "image_y_px": lambda scenes: _centre_px(scenes)[:, 1],

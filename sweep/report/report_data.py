@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import functools
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -28,6 +27,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.report.table import Column, Table, Value, axis_label, column, number
 from sweep.store.lifecycle import open_dataset, open_finished
 from sweep.tradeoff.pareto import WRONG, conditions_of, configuration_label
+from sweep.tradeoff.verdicts import BETTER, VERDICTS, WORSE, first_verdict, verdict
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -424,8 +424,6 @@ UNFLIPPED = Column("rotation RMSE ratio without flips", "rotation_rmse_unflipped
 #: quantities with a probability of 5 % at most (Bonferroni). Intervals of 95 % are shown.
 DECIDING_LEVEL = 1.0 - (1.0 - LEVEL) / len(PAIRED)
 
-VERDICTS = {1: "better", 0: "not decided", -1: "worse"}
-
 
 class Difference(NamedTuple):
     """One quantity of the best configuration against another one, on the images of both.
@@ -435,22 +433,21 @@ class Difference(NamedTuple):
     column, numbers
         The quantity, and its value with its 95 % interval, NaN without one.
     verdict
-        1: the best one is better; -1: it is worse; 0: not decided.
+        Whether the best one is better or worse, or neither and both are equivalent.
     """
 
     column: Column
     numbers: Value
-    verdict: int
+    verdict: str
 
     def as_json(self) -> dict[str, Any]:
         """Return it as JSON values."""
         words, _, unit = self.column.heading.partition(", ")
-        return {"quantity": words, **self.numbers._asdict(), "unit": unit,
-                "verdict": VERDICTS[self.verdict]}
+        return {"quantity": words, **self.numbers._asdict(), "unit": unit, "verdict": self.verdict}
 
     def __str__(self) -> str:
         words, _, unit = self.column.heading.partition(", ")
-        return f"{words} {self.numbers}{f' {unit}' if unit else ''}: {VERDICTS[self.verdict]}"
+        return f"{words} {self.numbers}{f' {unit}' if unit else ''}: {self.verdict}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -476,9 +473,10 @@ class Comparison:
         """Label of the configuration that is named best."""
         return self.known.names[self.best]
 
-    def verdict(self, k: int) -> int:
-        """Return whether the best one is better than another: by the first decided quantity."""
-        return overall(self.differences[k])
+    @property
+    def verdicts(self) -> list[str]:
+        """Whether the best one is better than each (n,), as `overall`."""
+        return [overall(pair) for pair in self.differences]
 
     @property
     def line(self) -> str:
@@ -489,16 +487,15 @@ class Comparison:
             return ""
         # The cost of a wrong belief is the question if nothing else varies.
         others = [k for k in others if not wrong[k]] or others
-        rival = min(others, key=self.verdict)
+        rival = max(others, key=lambda k: VERDICTS.index(self.verdicts[k]))
         pair = self.differences[rival]
-        shown = [each for each in pair if each.verdict] or [
+        shown = [each for each in pair if each.verdict in (BETTER, WORSE)] or [
             next((each for each in pair[2:] if not np.isnan(each.numbers.value)), pair[0])]
         # A right one that is better, and was not named, is worse than a third.
-        circle = "None is best: " * (self.verdict(rival) < 0 and not wrong[rival])
+        circle = "None is best: " * (overall(pair) == WORSE and not wrong[rival])
         line = f"{circle}{self.name} against {names[rival]}: {'; '.join(map(str, shown))}"
-        counts = Counter(map(self.verdict, others))
-        words = ", ".join(f"{word} {counts[verdict]}" for verdict, word in VERDICTS.items()
-                          if counts[verdict])
+        told = [self.verdicts[k] for k in others]
+        words = ", ".join(f"{word} {told.count(word)}" for word in VERDICTS if word in told)
         return line if len(others) == 1 else f"{line} (of {len(others)} others: {words})"
 
     def table(self) -> Table:
@@ -507,42 +504,44 @@ class Comparison:
         caption, headings = "Configurations, with 95 % intervals", [CONFIGURATION]
         cells = [each.cells(known.summary) for each in columns]
         if len(known.names) > 1:
-            verdicts = [verdict_words(pair) for pair in self.differences]
-            verdicts[self.best] = "best" if all(
-                self.verdict(k) > 0 or known.wrong[k] for k in range(len(known.names))
+            words = [verdict_words(pair) for pair in self.differences]
+            words[self.best] = "best" if all(
+                word == BETTER or known.wrong[k] for k, word in enumerate(self.verdicts)
                 if k != self.best) else "named"
             pairs: list[list[Any]] = [
                 [each.numbers for each in pair] or [None] * len(PAIRED)
                 for pair in self.differences]
             headings.append("verdict")
-            cells = [verdicts, *cells, *map(list, zip(*pairs, strict=True))]
+            cells = [words, *cells, *map(list, zip(*pairs, strict=True))]
             columns += PAIRED
             caption += (
-                f"; differences and ratios: {self.name} against each, trial by trial; verdict: "
-                "each against it; rotation without flips where few poses differ by them")
+                f"; differences, ratios: {self.name} against each, trial by trial; verdict: each "
+                "against it (equivalent: within 1 point of a rate, 5 % of an RMSE); rotation "
+                "without flips where few poses differ by them")
         return Table.of(caption, [*headings, *(each.heading for each in columns)],
                         list(zip(known.names, *cells, strict=True)), stub=len(headings))
 
     def as_json(self) -> list[dict[str, Any]]:
         """Return the differences of the best configuration from each, as JSON values."""
-        return [{"configuration": self.name, "against": name,
-                 "verdict": VERDICTS[self.verdict(k)],
+        return [{"configuration": self.name, "against": name, "verdict": self.verdicts[k],
                  "differences": [each.as_json() for each in self.differences[k]]}
                 for k, name in enumerate(self.known.names) if k != self.best]
 
 
 def verdict_words(differences: Sequence[Difference]) -> str:
     """Return by what the other one is better or worse: ``worse: detection; better: range``."""
-    first = overall(differences)
-    parts = [f"{VERDICTS[-verdict]}: {', '.join(names)}" for verdict in (first, -first) if (
+    first, other = overall(differences), {BETTER: WORSE, WORSE: BETTER}
+    if first not in other:
+        return first
+    parts = [f"{other[verdict]}: {', '.join(names)}" for verdict in (first, other[first]) if (
         names := [each.column.heading.split()[0] for each in differences
                   if each.verdict == verdict])]
-    return "; ".join(parts) if first else VERDICTS[0]
+    return "; ".join(parts)
 
 
-def overall(differences: Sequence[Difference]) -> int:
-    """Return the verdict of the first quantity that is decided; 0 if none is."""
-    return next((each.verdict for each in differences if each.verdict), 0)
+def overall(differences: Sequence[Difference]) -> str:
+    """Return the verdict on all quantities together."""
+    return first_verdict([each.verdict for each in differences])
 
 
 def comparison(data: ReportData, among: Sequence[int] | None = None) -> Comparison:
@@ -575,7 +574,7 @@ def comparison(data: ReportData, among: Sequence[int] | None = None) -> Comparis
         best = left.pop(0)
         tried[best] = [differences(k, best) for k in range(len(known.names))]
         better = {k for k in usable
-                  if overall(tried[best][k]) < 0 and known.wrong[k] <= known.wrong[best]}
+                  if overall(tried[best][k]) == WORSE and known.wrong[k] <= known.wrong[best]}
         beaten[best] = len(better)
         left.sort(key=lambda k: k not in better)
     # In a circle each is worse than another one: the one that is worse than the fewest.
@@ -595,8 +594,8 @@ def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, .
     out = []
     for each in (*PAIRED[:2], UNFLIPPED if few else PAIRED[2], PAIRED[3]):
         (numbers,), (ends,) = each.cells(shown), each.cells(deciding)
-        verdict = int(ends.low > each.level) - int(ends.high < each.level)
-        out.append(Difference(each, numbers, -verdict if each.level else verdict))
+        out.append(Difference(
+            each, numbers, verdict(ends.low, ends.high, each.level or 0.0)))
     return tuple(out)
 
 
@@ -630,7 +629,7 @@ def trade_lines(data: ReportData, trade: xr.Dataset, budget_ms: float | None = N
         within = [k for k in usable if budget_ms is None or cost[k] <= budget_ms]
         if within:
             found = comparison(here, within)
-            cheapest = next(k for k in within if k == found.best or found.verdict(k) <= 0)
+            cheapest = next(k for k in within if found.verdicts[k] != BETTER)
             budget = "" if budget_ms is None else f"within {budget_ms:g} ms a frame: "
             parts = [
                 f"{budget}{found.name}, {number(cost[found.best])} ms a frame",

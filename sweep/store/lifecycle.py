@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 # The layout of a store: its arrays, their metadata, and the values of its coordinates.
 
 #: Version of the layout of stores; another one is refused.
-FORMAT = 10
+FORMAT = 11
 
 
 class PlannedArray(NamedTuple):

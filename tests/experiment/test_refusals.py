@@ -41,7 +41,6 @@ def beside(**keys):
 
 
 TILTED = "[[board.markers]]\nmarker_id = 0\nx_m = 0\ny_m = 0\ntilt_deg = 90\nazimuth_deg = 90\n"
-UPRIGHT = beside(x_m=0.5, y_m=0, z_m=0, tilt_deg=90, azimuth_deg=0)
 
 
 def assert_told(error):
@@ -82,7 +81,6 @@ BROKEN = [
     (P + "tilt_deg = 3\n[axes]\ntilt_deg = [0, 1]",
      "axes.tilt_deg = [0, 1]: expected it once: pose.tilt_deg is given too"),
     (P + "[axes]\ntilt_deg = [0, 1, 0.0]", "expected each value once (0.0 is repeated)"),
-    (P + "[axes]\ntilt_deg = { linspace = [1, 1, 2] }", "each value once (1.0 is repeated)"),
     (P + "[axes]\ntilt_deg = { linspce = [0, 1, 3] }",
      "a table with one of range, arange, linspace, geom, values; did you mean linspace?"),
     (P + "[axes]\ntrial = 5",
@@ -94,7 +92,6 @@ BROKEN = [
     ("pose = 3\n[axes]\ndistance_m = [1]\nfy_px = [1]\ntrial = 4",
      "pose = 3: expected a table: [pose]"),
     (P + '[require]\nall = ["flips <= 0.1"]', 'all = "flips <= 0.1": nothing of this name has'),
-    (P + '[require]\nall = ["detection"]', 'require.all = "detection": expected NAME >= NUMBER'),
     (P + '[require]\nall = ["detection >= 0.9"]\nper = ["solver"]',
      "require.per: solver: no such axis; expected one under [axes] of the scene: there is none"),
     ("[pose\ndistance_m = 1", "not TOML: "),
@@ -102,19 +99,13 @@ BROKEN = [
      'scene.background = "none.png": expected a level or an image file (No such file'),
     (BOARD + TABLE.replace("0.1", "0.06"),
      "board.markers = [1, 2]: expected markers that do not overlap"),
-    (BOARD + TABLE.replace("= 2", "= 1"),
-     "board.markers = [1, 1]: expected each ID once; 1 is listed"),
     (BOARD + 'kind = "charuco"\nsquares_x = 20\nsquares_y = 20\nsquare_m = 0.06',
      "expected IDs from 0 to 49, which is what DICT_4X4_50 has; the board has 200 markers"),
     (BOARD + 'kind = "diamond"\nsquare_m = 0.05', "marker.size_m = 0.05: expected below square_m"),
-    (BOARD + GRID.replace("7", "1000"), "a board of at most 4000 markers; it has 5000"),
-    (BOARD + 'kind = "diamond"', 'board.square_m: missing; kind = "diamond"'),
     (BOARD + "rows = 3",
      "board.rows = 3: expected kind = grid, which uses it; kind = none does not"),
     (BOARD + GRID + beside(x_m=0.2, y_m=0.16),
      "board.distractors[0].x_m = 0.2: expected no overlap with the board, white quiet zones"),
-    (BOARD + GRID + UPRIGHT + UPRIGHT.replace("z_m = 0", "z_m = 0.03"),
-     "board.distractors[1].x_m = 0.5: expected no overlap with distractors[0]"),
     (BOARD + GRID + beside(x_m=0.5, y_m=0, marker_id=50),
      "board.distractors[0].marker_id = 50: expected an ID from 0 to 49, which is what DICT_4X4"),
     ((BOARD + GRID, "solver='ippe_square'"), "others with points = largest_marker"),
@@ -124,22 +115,16 @@ BROKEN = [
     (BOARD.replace('solver = "iterative"', "") + GRID,
      "expected one of ippe, iterative, sqpnp, epnp"),
     ("[pose]\ntilt_deg = [0, 30]", "an axis: they go under [axes]"),
-    ("[pose]\ntrial = 3", "belongs under [axes]"), ("trial = 3", "it belongs under [axes]"),
     ("solver = 'ippe'", "it belongs under [estimator]"), ("[pose]\nseed = 3", "at the top"),
     ("[camera]\nvelocty_x_m_s = 3", "did you mean velocity_x_m_s under [scene]?"),
     ("[detector]\ncornerRefinementMethod = 1", "expected one of none, subpix, contour, apriltag"),
-    ("[marker]\ndictionary = 4", "marker.dictionary = 4: expected one of DICT_4X4_100, "),
     ("[detector]\ncorner_refinement_method = 'subpix'", "did you mean cornerRefinementMethod?"),
     (("", "Tilt_Deg=3"), "did you mean tilt_deg?"),
     ((P, "tilt_deg"), "expected name=value"),
-    ((P, "tilt_deg=[0, 1"), "expected a TOML value"),
-    ((P, "solver=best"), 'estimator.solver = "best": expected one of'),
     ((P, "dictionary=4X4"), "; did you mean DICT_4X4_50?"),
-    ((P, "dictionary=tag41h12"), "; did you mean tagStandard41h12?"),
     ((P, "aprilTagDeglitch=1"), "aprilTagDeglitch = 1"),  # OpenCV reads memory that it never wrote
     ((AXES + "trial = 40", "sampling=sobol"),
      "axes.trial = 40: expected a multiple of 16, at least 32, for sampling"),
-    ((P, "sampling=halton"), 'sampling = "halton": expected one of independent, sobol'),
     (BOARD + 'kind = "markers"\n' + TILTED + TILTED.replace("id = 0", "id = 1"), "do not overlap"),
     *(((BOARD + 'kind = "markers"\n' + TILTED, setting), expected) for setting, expected in (
         ("solver=ippe", "one of iterative, sqpnp, epnp, photometric"),
@@ -155,8 +140,6 @@ BROKEN = [
 SECTIONS = [
     *(({"camera": camera, "pose": {"distance_m": 1.0}}, lines) for camera, *lines in (
         ({"hfov_deg": 60, "vfov_deg": 40}, "vfov_deg = 40: expected hfov_deg or vfov_deg, not"),
-        ({"vfov_deg": 60, "focal_length_mm": 5, "sensor_width_mm": 6},
-         "vfov_deg = 60: expected sensor_width_mm, focal_length_mm or vfov_deg, not both"),
         *(({"hfov_deg": bad}, f"camera.hfov_deg = {bad}: expected a number from 1e-05 to 179.9")
           for bad in (180, 0)),
     )),
@@ -170,13 +153,10 @@ SECTIONS = [
       for zipped, line in (
         ({"fx_px": [600, 800], "fy_px": [600]}, "lens: .* fx_px has 2, fy_px has 1"),
         ({"fx_px": [600, 800]}, "axes.lens = .* at least two parameters"),
-        ({"fx_px": [600, 800], "solver": ["ippe", "iterative"]}, "axes.lens: .* of one stage"),
-        ({"fx_px": [600, 800, 600], "fy_px": [600, 800, 600]}, "lens: .* 600, 600 is repeated"),
         ({"fx_px": [600, 800], "trial": 2}, "axes.lens.trial = 2: .* an axis of its own"),
         ({"fx_px": [600, 800], "fy_px": {"uniform": [600, 800]}}, "axes.lens.fy_px = .* [camera]"),
         ({"fx_px": [600, 800], "fy_px": {"zip": {"cx_px": [1, 2], "cy_px": [1, 2]}}},
          "axes.lens.fy_px = .* a name of your own"),
-        ({"distance_m": [1, 2], "tilt_deg": [1, 2]}, "axes.lens.distance_m = .* pose.distance_m"),
         ({"dictionary": ["DICT_4X4_50", "DICT_4X4_100"], "marker_id": [50, 99]},
          "marker_id = 50: expected IDs from 0 to 49"),
         ({"adaptiveThreshWinSizeMin": [3, 9], "adaptiveThreshWinSizeMax": [23, 5]},
@@ -191,11 +171,7 @@ SECTIONS += [
         ({"calibration_sd": SD}, {"believed": "calibration", "believed_fx_px": 600},
          "believed_fx_px = 600: expected no other belief about the camera beside believed"),
         ({"calibration_sd": [1, 1]}, {}, "calibration_sd = [1, 1]: expected a list of 0, 4, 8, 9"),
-        ({"calibration_sd": [1] * 8}, {}, "expected 4 numbers, of fx, fy, cx and cy, or 9"),
-        ({"calibration_sd": SD, "distortion": []}, {}, "distortion is empty"),
         ({"calibration_sd": [-1, 1, 1, 1]}, {}, "expected standard deviations of at least 0"),
-        ({"calibration_sd": SD, "calibration_covariance": np.eye(9).ravel().tolist()}, {},
-         "expected calibration_sd or calibration_covariance, not both"),
         ({"calibration_covariance": [1, 2, 0, 0, 2, 1, *[0] * 10]}, {}, "no correlation beyond 1"),
         ({"calibration_covariance": [1, 0.5, 0, 0, 0, 1, *[0] * 10]}, {}, "expected a symmetric"),
         ({}, {"believed_focal_scale": 1.01, "believed_fx_px": 600},
@@ -207,14 +183,11 @@ NAMES = [
       for name in ("detection", "xyz", "jitter_u_px", "solved", "outcome", "cost")),
     ({"my lens": TOGETHER}, "letters, digits and underscores"),
     ({"tilt_deg": TOGETHER}, "an axis of tilt_deg alone"),
-    ({"lens": TOGETHER, "fx_px": [1]}, "axes.lens.fx_px is given too"),
-    ({"a": TOGETHER, "b": TOGETHER}, "axes.a.fx_px is given too"),
 ]
 HOSTILE = [
     # Axes without end, in every form.
     (AXES + "marker_id = { range = [0, 1000000000000] }", "at most 1,000,000,000 values"),
     (AXES + "tilt_deg = { arange = [0, 1e299, 5e-324] }", "at most 1,000"),
-    (AXES + "trial = 1000000000000", "from 1 to 1,000,000,000"),
     (AXES + "tilt_deg = { linspace = [0, 1, 600000] }\nroll_deg = { linspace = [0, 1, 600000] }",
      "axes.roll_deg = {linspace = [0, 1, 600000]}: expected at most 1,000,000 values, all axes"),
     (AXES + "trial = 1000000000\nmarker_id = { range = [0, 50000] }", "poses: expected at most"),
@@ -227,15 +200,10 @@ HOSTILE = [
     ("x = " + "[" * 100_000, "not TOML: nested too deeply"),
     (P + "tilt_deg = " + "{a=" * 200 + "1" + "}" * 200, "= {a = {a = "),
     ("a" + ".a" * 100_000 + " = 1", "expected keys of at most 8 parts"),
-    (P + "x = '" + '"\\' * 50_000 + "'", "pose.x: unknown key"),
     # Size, and numbers without end.
     ("# " + "x" * 10_000_000, "expected at most 250,000 bytes"),
     (P + "".join(f"k{i} = 1\n" for i in range(2000)), "... and 1,980 faults more"),
-    (P + "k" * 200_000 + " = 1", "kkk...: unknown key"),
-    (AXES + f"tilt_deg = [{'1,' * 100_000}]", "each value once (1.0 is repeated)"),
     (f'title = "{"k" * 1000}"\n' + P, "one line of at most 200 characters"),
-    (P + f'[scene]\nbackground = "{"a/" * 100_000}"', "(File name too long)"),
-    (P + "tilt_deg = 1" + "0" * 100_000, "not TOML: Exceeds the limit (4300 digits)"),
     (P + f"tilt_deg = {DIGITS}", "pose.tilt_deg = 0x1000"),
     # What a terminal would obey, or take for a line of ours.
     (P + '"\\u001b[2J\\nforged: line" = 1', "pose.\\u001b[2J\\nforged: line: unknown key"),
@@ -283,13 +251,6 @@ def test_a_broken_file_ends_a_command_and_nothing_is_written(
     assert [path.name for path in tmp_path.iterdir()] == ["broken.toml"]
     assert main([command, "none.toml"]) == 2
     assert "cannot be read: No such file" in capsys.readouterr().err
-
-
-def test_all_faults_of_a_table_come_at_once():
-    lines = refusal(BOARD + TABLE.replace("x_m = 0\n", "X = 0\n") + "size_m = true")
-    assert [line.split(" ")[0] for line in lines] == [
-        "board.markers[0].X:", "board.markers[0].x_m:", "board.markers[1].size_m"
-    ]
 
 
 @pytest.mark.parametrize(("setting", "expected", "at"), [
@@ -415,8 +376,6 @@ KINDS = "expected one of charuco, grid, aprilgrid, markers"
      "square: unknown; expected a key of a board of kind charuco: "),
     (FILES["charuco"] + "ids = [1]",
      "ids = [1]: expected 32 IDs, one for each marker in reading order"),
-    (FILES["charuco"] + "ids = [1]\nfirst_id = 1",
-     "first_id = 1: expected ids or first_id, not both"),
     (FILES["grid"].replace("0.00475", "0"),
      "gap_m = 0.0: expected above 0 beside corner_squares = true"),
     ('kind = "markers"\ndictionary = "DICT_5X5_50"\nmarkers = []',

@@ -8,7 +8,6 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -257,20 +256,6 @@ def test_effects_and_their_order_make_another_experiment(tmp_path):
     assert not differences(first, store.pipeline, store.fingerprint)
 
 
-FOLDER = Path(__file__).parents[2] / "pipelines" / "plugins"
-
-
-def test_the_pipeline_runs_with_all_four():
-    pipeline = Pipeline.from_toml(FOLDER / "plugins.toml", ["trial=2", "side_px=60"])
-    assert {plugin.kind for plugin in pipeline.plugins} == {
-        "detector", "estimator", "effect", "renderer",
-    }
-    cells = run_cells(pipeline, [index.ravel() for index in np.indices((2, 2, 2))])
-    assert not cells.failures
-    assert (np.array(cells.columns["detection"]) == DetectionStatus.detected).all()
-    assert (np.array(cells.columns["estimate"]) == EstimateStatus.solved).all()
-
-
 BAD_DETECTOR = """
 import os
 import numpy as np
@@ -351,7 +336,7 @@ def test_what_a_function_margin_px_raises_is_the_plug_in_s_fault(bad):
 
 
 @pytest.mark.parametrize(("source", "told"), [
-    ("import missing_library", "missing_library"), ("x =", "SyntaxError"),
+    ("x =", "SyntaxError"),
     ("D = 3", "a record DetectorPlugin, not a value of type int"), ("", "a name in mine.py"),
     ("import beside_it\nD = print", "imports beside_it.py beside it; put both"),
     ("from sweep.plugins import DetectorPlugin\nD = DetectorPlugin(make=1)",
@@ -387,7 +372,6 @@ POSE = "[pose]\nside_px = 24\n"
      'detector.detector = "nowhere:D": expected the file nowhere.py in'),
     (POSE + '[detector]\ndetector = "apriltagg"', "expected an installed detector plug-in"),
     (POSE + '[estimator]\nsolver = "ippee"', "did you mean ippe?"),
-    (POSE + '[scene]\nrenderer = "nowhere:R"', "expected the file nowhere.py in"),
     ('effects = ["fog"]\n' + POSE, "expected an installed effect"),
     ('effects = "fog"\n' + POSE, "expected a list of plug-ins, each once"),
 ])
@@ -413,12 +397,9 @@ S = lambda settings: solve
 
 @pytest.mark.parametrize(("returned", "status", "told"), [
     ("(poses(n)[0] * np.nan, poses(n)[1])", EstimateStatus.solver_failed, None),
-    ("poses(n, depth=-0.4)", EstimateStatus.solver_failed, None),
     ("poses(n, depth=4.0)", EstimateStatus.solver_failed, None),
     ("poses(n, np.eye(3) * [1, 1, -1])", EstimateStatus.failed,
      "returned a rotation that is no rotation matrix"),
-    ("poses(n + 1)", EstimateStatus.failed,
-     "returned a rotation of shape (2, 3, 3); expected (1, 3, 3)"),
     ("None", EstimateStatus.failed, "returned a NoneType; expected a tuple"),
     ("(*poses(n), None, poses(n)[0])", EstimateStatus.failed, "returned half an alternative"),
 ])

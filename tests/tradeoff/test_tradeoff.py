@@ -20,6 +20,7 @@ from sweep.messages import to_json
 from sweep.tradeoff import costs
 from sweep.tradeoff import measurement as tradeoff
 from sweep.tradeoff.costs import LEAST_ROUNDS, MIN_ROUNDS, median_interval, time_in_turns
+from sweep.tradeoff.verdicts import first_verdict, verdict
 
 CAMERA = """
 seed = 3
@@ -252,3 +253,15 @@ def test_the_medians_interval_is_the_narrowest_of_order_statistics_that_covers(c
         return 1 - 2 * stats.binom.cdf(rank, count, 0.5)
 
     assert coverage(low) >= 0.95 > coverage(low + 1)
+
+
+@pytest.mark.parametrize(("low", "high", "equal", "expected"), [
+    (0.1, 0.3, 0.0, "better"), (-3.0, -0.1, 0.0, "worse"), (-1.0, 0.9, 0.0, "equivalent"),
+    (-1.1, 0.0, 0.0, "not decided"), (1.001, 1.01, 1.0, "worse"), (0.3, 0.9, 1.0, "better"),
+    (0.96, 1.04, 1.0, "equivalent"), (0.94, 1.0, 1.0, "not decided"),
+    (math.nan, math.nan, 1.0, "not decided"),
+])
+def test_verdicts(low, high, equal, expected):
+    assert verdict(low, high, equal) == expected
+    assert first_verdict(["equivalent", expected]) == (
+        "not decided" if expected == "not decided" else expected)

@@ -146,7 +146,7 @@ def judged_poses(answers: Sequence[Answer], scenes: Scenes) -> Finding:
     rows = [row for row, answer in enumerate(answers) if answer]
     if not rows:
         return Finding(FAULT, "no pose was solved")
-    _, rotation, translation, *_ = map(np.array, zip(*filter(None, answers), strict=True))
+    _, _, rotation, translation, *_ = map(np.array, zip(*filter(None, answers), strict=True))
     truth = scenes.translation[rows]
     error = pose_error(rotation, translation, scenes.rotation[rows], truth)
     away = np.linalg.norm(error.translation_m, axis=1) / np.linalg.norm(truth, axis=1)

@@ -24,7 +24,7 @@ from sweep.measure.flags import DetectionStatus
 from sweep.messages import to_json
 
 TOP = Path(__file__).parents[2]
-HEAVY = ("numpy", "dask", "xarray", "numba", "cv2", "zarr", "matplotlib", "jinja2", "rich")
+HEAVY = ("numpy", "dask", "xarray", "numba", "cv2", "zarr", "matplotlib", "jinja2", "rich.console")
 
 
 def python(code):

@@ -115,7 +115,7 @@ def joined(claims: list[dict[str, Any]]) -> list[list[str]]:
         key = each["what"], each["against"], each["unit"]
         figure = rows.get(key)
         rows[key] = each["worst"] if figure is None else max(figure, each["worst"])
-    return [[what, against, f"{worst:.2g} {unit}".strip()]
+    return [[what, against, f"{worst:.3g} {unit}".strip()]
             for (what, against, unit), worst in rows.items()]
 
 

@@ -1249,7 +1249,7 @@ def _column(
     target = read.transpose(*array.dims).values
     try:
         # Of Dask a part at a time: together they would be in memory twice. Few parts, for each
-        # looks through the names of all chunks.
+        # looks through the names of all chunks. What is in memory has none, and is one part.
         ends = np.cumsum(array.chunks[0], dtype=int).tolist() if array.chunks else []
         ends = [0, *ends[: -1 : len(ends) // 16 or 1], *ends[-1:]]
         for part in [*itertools.starmap(slice, itertools.pairwise(ends))] or (...,):

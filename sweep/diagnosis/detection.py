@@ -103,7 +103,7 @@ class DetectionModel:
         ambiguity
             Reprojection error of the chosen solution over that of the other one (n,), both of
             `cv2.solvePnPGeneric`; without it the flip's probability is that of the middle one.
-            Where it is NaN, below 0 or above all that were seen, nothing is known.
+            Where it is NaN, below 0 or above 1 and all that were seen, nothing is known.
 
         Returns
         -------

@@ -25,8 +25,11 @@ LEAST_SHARE = 0.001
 # even the likeliest cause does not explain the rows: (misfit - d)² > 16 * 2 d.
 SURPRISING = 16.0
 
-# Log-likelihood of a yaw below which none of them is explained: 2.8 standard deviations.
-SURPRISING_YAW = -6.5
+# Mean log-likelihood of yaws, relative to those said, below which they are not explained: off by
+# 2.8 standard deviations.
+SURPRISING_YAW = -3.9
+
+UNEXPLAINED = "No known cause explains these rows"
 
 
 def diagnose(
@@ -106,7 +109,7 @@ def diagnose(
           *(f"{each.fitted[k]:.4f}" for each in shown)) for k in range(len(row))], stub=2)
     missing = {cause.title: lack for cause in inference.CAUSES if (lack := cause.lacks(rows))}
     numbers = {
-        "sentence": sentence, "decided": not open_,
+        "sentence": sentence, "decided": not open_ and UNEXPLAINED not in sentence,
         "causes": [{
             "causes": sorted(each.names) or [inference.AGREE], "title": each.words("title"),
             "probability": each.probability, "size": size,
@@ -122,7 +125,7 @@ def diagnose(
         lines.append("not looked for: " + "; ".join(
             f"{title} (needs {lack})" for title, lack in missing.items()))
     return Findings([causes, tests, predictions, *lines, sentence], numbers,
-                    status=UNDECIDED if open_ else 0)
+                    status=0 if numbers["decided"] else UNDECIDED)
 
 
 def size_of(each: inference.Explanation, rows: Observations) -> str:
@@ -149,8 +152,8 @@ def _sentence(
     count = len(rows.cells[0])
     if misfit - count > np.sqrt(2.0 * SURPRISING * count) or (
             first.yaw_evidence < SURPRISING_YAW * np.isfinite(rows.yaw_off[:, 0]).sum()):
-        return ("No known cause explains these rows: look for a mistaken one, or sign of yaw_deg, "
-                "or state larger standard deviations.")
+        return (f"{UNEXPLAINED}: look for a mistaken row, or a wrong sign of "
+                "yaw_deg, or state larger standard deviations.")
     if not first.names and (rows.side_px < READABLE_PX).any():
         return ("What was said agrees with what was measured, but no detector reads a square of "
                 f"{rows.side_px.min():.2g} px: are size_m and all distances in metres?")

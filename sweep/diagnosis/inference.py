@@ -155,7 +155,7 @@ def size_ratios(dictionary: str) -> dict[float, str]:
 # square in the image over f size / z, and its prior share.
 UNIT_KINDS = (
     # As long as it is itself, such a size makes tvec; so does a tape in other units.
-    ("size_m, or the tape the other way,", (1, 1, 1), 0, 0.45), ("tvec", (1, 1, 1), 1, 0.45),
+    ("size_m (or the tape, inversely)", (1, 1, 1), 0, 0.45), ("tvec", (1, 1, 1), 1, 0.45),
     ("tvec_z_m alone", (0, 0, 1), 1, 0.09), ("tvec_x_m and tvec_y_m", (1, 1, 0), 0, 0.01))
 
 
@@ -345,7 +345,7 @@ class Explanation:
     fitted, sd
         Expected readings of the tape (d,), and the standard deviations of its noise.
     yaw_evidence
-        Log-likelihood of the measured yaws.
+        Log-likelihood of the measured yaws, relative to yaws as they were said.
     probability
         Posterior probability among all explanations.
     """
@@ -444,14 +444,17 @@ def explain(rows: Observations, causes: tuple[Cause, ...], log_prior: float) -> 
 
 
 def _yaw_evidence(rows: Observations, flipped_share: float) -> float:
-    """Return the log-likelihood of the measured yaws: each as said, or as said or mirrored."""
+    """Return the log-likelihood of the measured yaws: each as said, or as said or mirrored.
+
+    It is relative to that of a yaw as it was said, which is the same for all causes.
+    """
     known = np.isfinite(rows.yaw_off[:, 0])
     spread = np.hypot(rows.yaw_sd, ROTATION_SD_DEG)[known, None]
     off = (rows.yaw_off[known] + 180.0) % 360.0 - 180.0
     # A marker seen from behind or turned by 180 degrees is some other mistake: no tail is thinner
     # than a uniform share of 1 %.
-    likelihood = 0.99 * np.exp(-0.5 * (off / spread) ** 2) / (
-        spread * math.sqrt(2.0 * math.pi)) + 0.01 / 360.0
+    likelihood = 0.99 * np.exp(-0.5 * (off / spread) ** 2) + 0.01 / 360.0 * (
+        spread * math.sqrt(2.0 * math.pi))
     return float(np.log(likelihood @ [1.0 - flipped_share, flipped_share]).sum())
 
 

@@ -62,7 +62,7 @@ def compared(
     rotation, translation = batch.scenes.rotation[rows], batch.scenes.translation[rows]
     error = estimation.pose_error(estimates.rotation, estimates.translation, rotation, translation)
     covariance = estimates.covariance
-    if "truth_std" in batch.values and "neighbourhood" not in batch.values:  # no exact twins
+    if "truth_std" in batch.values and "neighbourhood" not in batch.values:  # twins are exact
         std = np.nan_to_num(batch.values["truth_std"].values[rows]).astype(np.float64)
         covariance = covariance + std[:, None] ** 2 * np.eye(std.shape[1])
     return EstimationResults(estimates, error, rotation, covariance)

@@ -262,7 +262,7 @@ def forecast_of(
     url: str, pipeline: Pipeline, timing: Timing, blocks: Blocks, workers: int,
     left: int | None = None,
 ) -> SimpleNamespace:
-    """Return the expected cost of a run of ``left`` of its blocks, in waves if all have to be run.
+    """Return the expected cost of ``left`` of a run's blocks (default: all), waves or not.
 
     Returns
     -------

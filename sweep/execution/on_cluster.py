@@ -16,7 +16,6 @@ from urllib.parse import urlsplit
 
 from distributed import Client, KilledWorker, LocalCluster, Security, get_worker, wait
 from distributed.core import rpc
-from distributed.deploy.cluster import Cluster
 
 from sweep.errors import ArgumentError, RunError, StoreReplacedError
 from sweep.evaluation.results import differing_processors, processor
@@ -46,8 +45,7 @@ WORKERS_S = 60.0
 
 @contextlib.contextmanager
 def connected(
-    pipeline: Pipeline, scheduler: str | None, client: Client | Cluster | None,
-    workers: int | None = None,
+    pipeline: Pipeline, scheduler: str | None, client: object, workers: int | None = None,
 ) -> Iterator[OnCluster]:
     """Return the executor on a cluster.
 
@@ -78,7 +76,7 @@ def connected(
                     logger.setLevel(logging.CRITICAL)
             own = stack.enter_context(_local_cluster(workers or default_workers())) \
                 if scheduler == LOCAL else _checked_address(scheduler)
-        elif not isinstance(client, (Client, Cluster)):
+        elif not (isinstance(client, Client) or hasattr(client, "scheduler_address")):
             raise ArgumentError(
                 "client", client,
                 "expected a distributed.Client or a cluster object such as LocalCluster; "

@@ -948,13 +948,13 @@ def locate_photograph(
     unused = np.empty((MOVED, MOVED))
     state, level, reached, other = likelihood.locate(
         view, work, freedom, coarse,
-        system(coarse.levels.shape[0], coarse.levels.shape[1]), starts, REAL, unused,
-    )
+        system(coarse.levels.shape[0], coarse.levels.shape[1]), starts, REAL, unused)
     if likelihood.turn_between(state, other) > SAME_POSE_RAD:
         # The search ends where a minimum cannot be the best, which may be far from it.
         likelihood.descend(
-            view, other, work, freedom, likelihood.COARSE_STEPS, 1.0, math.inf, unused
-        )
+            view, other, work, freedom, likelihood.COARSE_STEPS, 1.0, math.inf, unused)
+        if likelihood.turn_between(state, other) <= SAME_POSE_RAD:
+            other[:] = math.nan  # there is no other minimum
     misfit = judge(view, state, work, covariance) if reached else math.nan
     return state, level, reached, other, freedom, misfit
 

@@ -304,7 +304,7 @@ def check_resolution(
     written: str, camera: Calibration, size: tuple[int, int], found: Sequence[FoundCorners],
     rms_px: float,
 ) -> None:
-    """Refuse a camera of a file that fits the board far better in another resolution.
+    """Refuse a file's camera that fits the board badly, or far better in another resolution.
 
     Parameters
     ----------
@@ -315,8 +315,7 @@ def check_resolution(
     found
         The board's corners in each photograph.
     rms_px
-        Their RMS in the median photograph with this camera; NaN if it is not known. Also refused
-        where a calibration's would be.
+        Their RMS in the median photograph with this camera; NaN if it is not known.
 
     Raises
     ------
@@ -426,7 +425,7 @@ def _rms_fault(rms_px: float, size: tuple[int, int]) -> str:
     limit = MAX_RMS_PX * max(1.0, size[0] / 800)
     return "" if not rms_px > limit else (
         f"corners are {rms_px:.2g} px RMS beside the camera; expected at most {limit:.2g} px: "
-        "check the board's kind, that it is flat, and that all photographs are of one camera"
+        "check the board's kind, that it is flat, and that all photographs are of this camera"
     )
 
 

@@ -324,8 +324,8 @@ def _summary(sides: Sequence[Side], dictionary: str) -> list[str]:
     empty = [Path(records[k].paths[i]).name for k, i in np.argwhere(~with_pose).tolist()]
     count = int(with_pose.any(axis=0).sum())
     share = shown.sum() / (shown.sum() + len(empty) * shown.shape[2])
-    lines = [(f"no pose of a marker is known in {folder.named(empty)}: not counted; were all "
-              f"markers in them and missed, rates would be times {share:.2f}")] if empty else []
+    lines = [(f"no pose of a marker is known in {folder.named(empty)}: not counted; with all of "
+              f"their markers missed, rates would be {share:.2f} times as large")] if empty else []
     std, translation, sources = (
         np.array([getattr(each, name) for each in records])[shown]
         for name in ("std", "translation", "source")

@@ -15,7 +15,7 @@ import xarray as xr
 
 from sweep.analysis import error_statistics
 from sweep.analysis.comparisons import paired_tables
-from sweep.analysis.dataset import QUANTITIES, SIZE_AXES, is_grid_axis, of_photographs
+from sweep.analysis.dataset import QUANTITIES, SIZE_AXES, is_grid_axis, of_photographs, sections_of
 from sweep.analysis.estimator import LEVEL
 from sweep.analysis.requirements import ANGLE_AXES, SIZES_BESIDE, conditions, parse_requirements
 from sweep.errors import StoreError, SweepError, texts_of
@@ -300,7 +300,7 @@ def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
 
     If there are more than `MAX_CONFIGURATIONS`, values of the longest axes are chosen, evenly
     spaced. Of a store with neither settings nor targets to compare, by the values of its effects;
-    without effects, by those of what else varies but sizes in the image, angles and IDs.
+    without effects, by those of what else varies but poses and IDs.
     """
     if targets in data.compared:
         return data.compared[targets]
@@ -310,7 +310,7 @@ def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
         # Nothing else varies on the same draws: the values of an effect, such as noise or JPEG
         # quality, are compared; else those of a quiet zone, or a lens, whose draws are their own.
         others = [axis for axis in data.pipeline.axes if axis.name in data.scene_axes
-                  and axis.name not in (*SIZE_AXES, *ANGLE_AXES, IDS)]
+                  and axis.name != IDS and "pose" not in sections_of(axis.name, data.results)]
         several = [axis for axis in others if not is_grid_axis(axis.name, data.results)] or others
     counts = {axis.name: len(axis) for axis in several}
     while math.prod(counts.values()) > MAX_CONFIGURATIONS and max(counts.values()) > 2:
@@ -433,7 +433,7 @@ class Difference(NamedTuple):
     column, numbers
         The quantity, and its value with its 95 % interval, NaN without one.
     verdict
-        Whether the best one is better or worse, or neither and both are equivalent.
+        One of `VERDICTS`: how the best one is.
     """
 
     column: Column
@@ -462,11 +462,14 @@ class Comparison:
         Number of the configuration that is named best.
     differences
         (n,) the best one against each: detection, solved, rotation, range; none against itself.
+    circle
+        Whether each that might be named is worse than another one of them.
     """
 
     known: Configurations
     best: int
     differences: list[tuple[Difference, ...]]
+    circle: bool
 
     @property
     def name(self) -> str:
@@ -475,7 +478,7 @@ class Comparison:
 
     @property
     def verdicts(self) -> list[str]:
-        """Whether the best one is better than each (n,), as `overall`."""
+        """Whether the best one is better than each (n,): `overall`."""
         return [overall(pair) for pair in self.differences]
 
     @property
@@ -490,9 +493,9 @@ class Comparison:
         rival = max(others, key=lambda k: VERDICTS.index(self.verdicts[k]))
         pair = self.differences[rival]
         shown = [each for each in pair if each.verdict in (BETTER, WORSE)] or [
-            next((each for each in pair[2:] if not np.isnan(each.numbers.value)), pair[0])]
-        # A right one that is better, and was not named, is worse than a third.
-        circle = "None is best: " * (overall(pair) == WORSE and not wrong[rival])
+            next((each for each in (*pair[2:], *pair) if each.verdict == self.verdicts[rival]
+                  and not np.isnan(each.numbers.value)), pair[0])]
+        circle = "None is best: " * self.circle
         line = f"{circle}{self.name} against {names[rival]}: {'; '.join(map(str, shown))}"
         told = [self.verdicts[k] for k in others]
         words = ", ".join(f"{word} {told.count(word)}" for word in VERDICTS if word in told)
@@ -508,9 +511,8 @@ class Comparison:
             words[self.best] = "best" if all(
                 word == BETTER or known.wrong[k] for k, word in enumerate(self.verdicts)
                 if k != self.best) else "named"
-            pairs: list[list[Any]] = [
-                [each.numbers for each in pair] or [None] * len(PAIRED)
-                for pair in self.differences]
+            pairs: list[list[Any]] = [[each.numbers for each in pair] or [None] * len(PAIRED)
+                                      for pair in self.differences]
             headings.append("verdict")
             cells = [words, *cells, *map(list, zip(*pairs, strict=True))]
             columns += PAIRED
@@ -579,7 +581,7 @@ def comparison(data: ReportData, among: Sequence[int] | None = None) -> Comparis
         left.sort(key=lambda k: k not in better)
     # In a circle each is worse than another one: the one that is worse than the fewest.
     best = min(beaten, key=beaten.__getitem__)
-    return Comparison(known, best, tried[best])
+    return Comparison(known, best, tried[best], beaten[best] > 0)
 
 
 def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, ...]:
@@ -589,13 +591,11 @@ def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, .
     """
     shown, deciding = paired_tables(
         first, second, (), None, QUANTITIES[:2], (LEVEL, DECIDING_LEVEL))
-    flipped = int(shown["only_first_flipped"]) + int(shown["only_second_flipped"])
-    few = 0 < flipped < MIN_FLIPPED
+    few = 0 < int(shown["only_first_flipped"] + shown["only_second_flipped"]) < MIN_FLIPPED
     out = []
     for each in (*PAIRED[:2], UNFLIPPED if few else PAIRED[2], PAIRED[3]):
         (numbers,), (ends,) = each.cells(shown), each.cells(deciding)
-        out.append(Difference(
-            each, numbers, verdict(ends.low, ends.high, each.level or 0.0)))
+        out.append(Difference(each, numbers, verdict(ends.low, ends.high, each.level or 0.0)))
     return tuple(out)
 
 

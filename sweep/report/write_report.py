@@ -436,7 +436,8 @@ def required(
     compared = report_data.comparison(data, equal)
     best = compared.best
     whose = f", with {known.names[best]}" if len(known.names) > 1 else ""
-    if data.pipeline.stopping is not None and data.pipeline.stopping.kind == "cheapest":
+    stopping = data.pipeline.stopping
+    if stopping is not None and stopping.kind == "cheapest" and combined[best] is Decision.met:
         # Costs are measured where they are asked for: the store has none.
         whose = caption_of("cheapest", met=combined.count(Decision.met), count=len(places),
                            command=quoted("sweep", "size", data.store))

@@ -31,8 +31,8 @@ STARTED = []
 
 
 def seen(event, arguments):
-    """Note a process that is started."""
-    if event in {"subprocess.Popen", "os.fork", "os.posix_spawn"}:
+    """Note a process that is started, but Matplotlib's of `fc-list` where it lists fonts once."""
+    if event in {"subprocess.Popen", "os.fork", "os.posix_spawn"} and "fc-list" not in arguments:
         STARTED.append(" ".join(map(str, arguments[1])) if len(arguments) > 1 else event)
 
 

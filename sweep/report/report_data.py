@@ -623,7 +623,8 @@ def trade_lines(data: ReportData, trade: xr.Dataset, budget_ms: float | None = N
         keep = {name: np.flatnonzero(results[name].values == value) for name, value in at.items()}
         here = dataclasses.replace(data, results=results.isel(keep), compared={})
         known = configurations(here, targets=False)
-        names, cost = known.names, part["cost_ms"].reindex(treatment=known.names).values.tolist()
+        # By pandas: NumPy 2.1 cannot copy an array of strings, as xarray does.
+        names, cost = known.names, part["cost_ms"].to_series().reindex(known.names).tolist()
         usable = [k for k in np.argsort(cost, kind="stable").tolist()
                   if not known.wrong[k] and np.isfinite(cost[k])]
         within = [k for k in usable if budget_ms is None or cost[k] <= budget_ms]

@@ -146,9 +146,9 @@ def judged_poses(answers: Sequence[Answer], scenes: Scenes) -> Finding:
     rows = [row for row, answer in enumerate(answers) if answer]
     if not rows:
         return Finding(FAULT, "no pose was solved")
-    _, _, rotation, translation, *_ = map(np.array, zip(*filter(None, answers), strict=True))
+    found = Estimates(*map(np.array, zip(*filter(None, answers), strict=True)))
     truth = scenes.translation[rows]
-    error = pose_error(rotation, translation, scenes.rotation[rows], truth)
+    error = pose_error(found.rotation, found.translation, scenes.rotation[rows], truth)
     away = np.linalg.norm(error.translation_m, axis=1) / np.linalg.norm(truth, axis=1)
     turned, percent = np.degrees(np.median(error.rotation_angle_rad)), 100 * np.median(away)
     right = turned <= MAX_ROTATION_DEG and percent <= MAX_POSITION_PERCENT

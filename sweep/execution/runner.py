@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-
 # --------------------------------------------------------------------------------------------------
 # A run from a pipeline to a finished store: prepare, compute and finish, in order.
 

@@ -329,39 +329,39 @@ def try_plugins(pipeline: Pipeline) -> None:
 #: Solvers whose compiled code is loaded, if the pipeline has them; else that of the first.
 SOLVERS = ("ippe_square", "photometric", "photometric_real")
 
-TITLE = "A standard scene"
-
 #: Rotation error of the standard scene; with the supported solvers it is below 0.05.
 MAX_ERROR_RAD = 0.2
 
 
-def warm_up(pipeline: Pipeline) -> None:
+def warm_up(pipeline: Pipeline | None = None) -> None:
     """Load the compiled code that a pipeline needs by computing a scene of known pose with it.
 
     Its renderers, bounds and solvers are used, without plug-ins, but none of its scenes, which may
-    end the process.
+    end the process; a little noise, if it has effects on the image. Without a pipeline, what
+    nearly all of them need.
 
     Raises
     ------
     MachineFaultError
         If the scene cannot be computed, or the marker's pose is not the recorded one.
     """
-    renderers = sorted(
-        name for name in set(pipeline.values_of("renderer"))
-        if pipeline.plugin("renderer", name) is None
-    )
-    solvers = [name for name in SOLVERS if name in pipeline.values_of("solver")]
-    standard = Pipeline.from_dict({
-        "title": TITLE,
-        "camera": {"width_px": 160, "height_px": 120},
-        "pose": {"side_px": 60, "tilt_deg": 45},
-        "scene": {"noise_grey": 1.0},
-        "axes": {
+    scene: dict[str, Any] = {
+        "title": "A standard scene", "pose": {"side_px": 60, "tilt_deg": 45},
+        "camera": {"width_px": 160, "height_px": 120}}
+    if pipeline is not None:
+        renderers = sorted(
+            name for name in set(pipeline.values_of("renderer"))
+            if pipeline.plugin("renderer", name) is None
+        )
+        solvers = [name for name in SOLVERS if name in pipeline.values_of("solver")]
+        scene["axes"] = {
             "renderer": renderers or ["exact"],
-            "bound": sorted(set(pipeline.values_of("bound"))),
-            "solver": solvers or [SOLVERS[0]],
-        },
-    })
+            "bound": sorted({*pipeline.values_of("bound")}),
+            "solver": solvers or [SOLVERS[0]]}
+        effects = any([*pipeline.values_of(each.switch)] != [each.off]
+                      for each in pipeline.experiment.effects)
+        scene["scene"] = {"noise_grey": float(effects)}
+    standard = Pipeline.from_dict(scene)
     try:
         values = compute_block(standard.experiment, standard.experiment.all_scenes)
     except MachineFaultError:

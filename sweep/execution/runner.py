@@ -37,20 +37,20 @@ if TYPE_CHECKING:
 # --------------------------------------------------------------------------------------------------
 # A run from a pipeline to a finished store: prepare, compute and finish, in order.
 
-#: Seconds that compilation takes: for all runs, for the bound and `photometric` beyond that, and
-#: for `photometric_real`.
-RENDERER_S, LIKELIHOOD_S, PHOTOGRAPH_S = 8, 10, 20
-
-
 def announce_compilation(pipeline: Pipeline) -> None:
     """Say in a line on stderr that a pipeline's functions are compiled, if they have not been."""
-    solvers, needed = pipeline.values_of("solver"), {"model.coverage.accumulate": RENDERER_S}
-    if "photometric" in solvers or set(pipeline.values_of("bound")) - {"none"}:
-        needed["measure.likelihood.descend"] = LIKELIHOOD_S
-    if "photometric_real" in solvers:
-        needed["measure.photograph.locate_photograph"] = PHOTOGRAPH_S
-    seconds = sum(length for name, length in needed.items()
-                  if not compilation.is_cached(*f"sweep.{name}".rsplit(".", 1)))
+    solvers, bounds = pipeline.values_of("solver"), {*pipeline.values_of("bound")} - {"none"}
+    changing = {"lens distortion", *(effect.label for effect in pipeline.experiment.effects)}
+    # Function -> how many seconds it takes with those that it needs, and whether it is used.
+    needed = {
+        "model.coverage.draw_greys": (3, True),
+        "model.exposure.outline_extent": (
+            4, any(part.active and part.name in changing for part in pipeline.facts.parts)),
+        "measure.likelihood.descend": (20, "photometric" in solvers or bounds),
+        "measure.photograph.locate_photograph": (30, "photometric_real" in solvers),
+    }
+    seconds = sum(length for name, (length, used) in needed.items()
+                  if used and not compilation.is_cached(*f"sweep.{name}".rsplit(".", 1)))
     if seconds:
         notice(f"compiling, once for this version: about {seconds} s")
 
@@ -91,14 +91,13 @@ def execute(
     make_rule(pipeline)  # it refuses names that it does not know
     workers, time_limit_s = options["workers"], options["time_limit_s"]
     scheduler, client = options["scheduler"], options["client"]
-    reuse, overwrite, retry_failed = (
-        options["reuse"], options["overwrite"], options["retry_failed"])
+    reuse, overwrite = options["reuse"], options["overwrite"]
     errors.check_positive("workers", workers, "expected at least 1", whole=True)
     if scheduler is not None and client is not None:
         raise errors.ArgumentError("scheduler", scheduler, "expected no client beside it")
     errors.check_positive("time_limit_s", time_limit_s, "expected seconds above 0")
     reuse = reuse if isinstance(reuse, Sequence) and not isinstance(reuse, str) else [reuse]
-    if retry_failed and reuse:
+    if options["retry_failed"] and reuse:
         raise errors.ArgumentError(
             "reuse", errors.path_of("reuse", reuse[0]), "expected no retry_failed beside it")
     display = progress.progress_report(options["progress"])
@@ -107,7 +106,7 @@ def execute(
     url = errors.path_of("store", store) if store is not None else f"runs/{pipeline.name}.zarr"
     begun = _store_to_continue(url, pipeline, overwrite)
     done = set() if begun is None else blocks.committed(begun)
-    again = status.failed_blocks(begun, done) if begun and retry_failed else {}
+    again = status.failed_blocks(begun, done) if begun and options["retry_failed"] else {}
     stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
     if begun is not None and begun.finished and not (again or stricter):
         blocks.check_whole(begun)
@@ -196,8 +195,7 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
         with changing(url, storage):
             return None
     store = lifecycle.open_store(url, "r+")
-    lines = differences(pipeline, store.pipeline, store.fingerprint)
-    if lines:
+    if lines := differences(pipeline, store.pipeline, store.fingerprint):
         advice = "choose another store, or overwrite it"
         with contextlib.suppress(errors.StoreError):
             if match(pipeline, store).done:

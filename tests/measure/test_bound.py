@@ -466,7 +466,7 @@ def test_a_marker_is_before_the_camera_where_its_whole_outline_is_and_faces_it()
     view = marker_view(single_marker("DICT_4X4_50", 3, 1.0), 0.1, optics, corner, 1.0)
     # Of 6 modules, with a quiet zone of one.
     outline = 0.05 * 8 / 6 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
-    for turn in Rotation.random(300, rng=rng):
+    for turn in Rotation.random(300, rng):
         position = rng.uniform([-0.03, -0.03, 0.02], [0.03, 0.03, 0.08])
         facing = turn.as_matrix()[:, 2] @ position < 0
         found.append(facing and (turn.apply(outline) + position)[:, 2].min() > 0)

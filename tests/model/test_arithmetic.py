@@ -438,7 +438,7 @@ TOLERANCE = 4e-15
 
 
 def test_tilt_azimuth_and_roll_of_a_rotation_make_it_and_lie_in_their_ranges():
-    rotation = Rotation.random(5000, rng=2).as_matrix()
+    rotation = Rotation.random(5000, np.random.default_rng(2)).as_matrix()
     tilt, *around = angles_of_rotation(rotation)
     np.testing.assert_allclose(rotation_of_angles(tilt, *around), rotation, atol=TOLERANCE)
     assert ((tilt >= 0) & (tilt <= np.pi)).all()

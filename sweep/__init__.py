@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from sweep.analysis.dataset import decode_flags
+    from sweep.cli.reference import reference
     from sweep.diagnosis.detection import error_model
     from sweep.diagnosis.diagnosis import diagnose
     from sweep.execution.runner import limit
     from sweep.experiment.pipeline import Pipeline
     from sweep.fitting.fit import fit
     from sweep.report.findings import measure_tradeoff, require
-    from sweep.report.reference import reference
     from sweep.report.table import Findings
     from sweep.report.write_report import write_report
     from sweep.tradeoff.choice_search import size

@@ -1,4 +1,4 @@
-"""Text for users: messages of few, short, printable lines, tables in columns, and JSON.
+"""Text for users: messages of few, short, printable lines.
 
 Messages quote names and values of files that may be anyone's. Quotes are cut and their control
 characters escaped, so that they neither forge a line nor control a terminal.
@@ -7,19 +7,16 @@ characters escaped, so that they neither forge a line nor control a terminal.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import difflib
-import enum
 import glob
 import itertools
 import json
-import math
 import os
 import re
 import shlex
 import socket
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -146,47 +143,6 @@ def nearest_file(path: str | os.PathLike[str]) -> str:
 def letters_of(word: str) -> str:
     """Return the letters and digits by which a word is known, in lower case."""
     return re.sub(r"[\W_]", "", word.casefold())
-
-
-def to_json(content: Mapping[str, Any], indent: int | None = 2) -> str:
-    r"""Return the text of a JSON object: what every command prints with ``--json``.
-
-    Dataclasses, enumerations (by name), paths, NumPy's arrays and numbers count as what JSON has.
-    A number that does not exist (NaN) is ``null``. So is an infinite one, and a key NAME_flag
-    beside its NAME says ``"infinite"`` or ``"-infinite"``; beside a list, NAME_flag is a list of
-    that shape with ``null`` for its other items.
-
-    >>> to_json({"low": 0.5, "high": math.inf, "median": math.nan}, None)
-    '{"low": 0.5, "high": null, "high_flag": "infinite", "median": null}'
-    >>> to_json({"errors": [1.0, -math.inf]}, None)
-    '{"errors": [1.0, null], "errors_flag": [null, "-infinite"]}'
-    """
-    return json.dumps(_json_value(content)[0], indent=indent, allow_nan=False)
-
-
-def _json_value(value: Any) -> tuple[Any, Any]:
-    """Return a value as JSON has it, and its flag: None if no number in it is infinite."""
-    if isinstance(value, enum.Enum):
-        return value.name, None
-    if dataclasses.is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    elif hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        found = {}
-        for name, item in value.items():
-            key = str(getattr(name, "name", name))
-            found[key], flag = _json_value(item)
-            if flag is not None:
-                found[f"{key}_flag"] = flag
-        return found, None
-    if isinstance(value, (list, tuple, set, frozenset)):
-        pairs = [_json_value(item) for item in value]
-        flags = [flag for _, flag in pairs]
-        return [item for item, _ in pairs], flags if any(flags) else None
-    if isinstance(value, float) and not math.isfinite(value):
-        return None, None if math.isnan(value) else "infinite" if value > 0 else "-infinite"
-    return value if isinstance(value, (str, bool, int, float, type(None))) else str(value), None
 
 
 def duration(seconds: float) -> str:

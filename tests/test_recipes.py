@@ -115,7 +115,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA, VARIABLES
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.model.renderers import marker_levels
-from sweep.report.reference import TABLES
+from sweep.cli.reference import TABLES
 
 def effects():
     pipeline = Pipeline.from_dict({

@@ -18,8 +18,8 @@ from sweep.analysis.dataset import bearing_of, focal_size_of, sight_rotation, vi
 from sweep.analysis.error_models import FRONTAL_DEG, differences, hat_basis
 from sweep.errors import DatasetError
 from sweep.measure.flags import EstimateStatus, Flipped
-from sweep.messages import to_json
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
+from sweep.report.table import to_json
 from sweep.store.lifecycle import open_dataset
 from sweep.typing import Floats, Masks
 

@@ -29,7 +29,7 @@ from sweep.execution.progress import progress_display, stage_display
 from sweep.execution.runner import execute
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.pipeline import parse_selection
-from sweep.messages import label, nearest, notice, quoted, to_json
+from sweep.messages import label, nearest, notice, quoted
 from sweep.plugins.loading import is_recording
 from sweep.report import table as tables
 from sweep.report.figure import Figure, write_figure
@@ -694,7 +694,7 @@ def model_findings(data: ReportData, files: Sequence[Path]) -> Findings:
         "pipeline": data.pipeline.text,
     })
     for file in files:
-        write_output_file(file, f"{to_json(content, indent=1)}\n".encode())
+        write_output_file(file, f"{tables.to_json(content, indent=1)}\n".encode())
     return Findings(
         [error_model_table(models), *(f"- {line}" for line in warnings_of(models))],
         content, models, 0,

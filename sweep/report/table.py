@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
+import enum
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +17,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sweep.messages import plain, to_json
+from sweep.messages import plain
 
 #: Rows of a table that a page shows.
 MAX_ROWS = 300
@@ -415,6 +418,50 @@ def table_of(
     cells = {axis_label(units, dim): group_cells(frame, dim) for dim in dims}
     cells |= {each.heading: each.cells(frame) for each in wanted}
     return Table(caption, pd.DataFrame(cells, dtype=object), len(dims))
+
+
+# --------------------------------------------------------------------------------------------------
+# JSON: what every command prints with ``--json``, and files of error models.
+
+def to_json(content: Mapping[str, Any], indent: int | None = 2) -> str:
+    r"""Return the text of a JSON object: what every command prints with ``--json``.
+
+    Dataclasses, enumerations (by name), paths, NumPy's arrays and numbers count as what JSON has.
+    A number that does not exist (NaN) is ``null``. So is an infinite one, and a key NAME_flag
+    beside its NAME says ``"infinite"`` or ``"-infinite"``; beside a list, NAME_flag is a list of
+    that shape with ``null`` for its other items.
+
+    >>> to_json({"low": 0.5, "high": math.inf, "median": math.nan}, None)
+    '{"low": 0.5, "high": null, "high_flag": "infinite", "median": null}'
+    >>> to_json({"errors": [1.0, -math.inf]}, None)
+    '{"errors": [1.0, null], "errors_flag": [null, "-infinite"]}'
+    """
+    return json.dumps(_json_value(content)[0], indent=indent, allow_nan=False)
+
+
+def _json_value(value: Any) -> tuple[Any, Any]:
+    """Return a value as JSON has it, and its flag: None if no number in it is infinite."""
+    if isinstance(value, enum.Enum):
+        return value.name, None
+    if dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    elif hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        found = {}
+        for name, item in value.items():
+            key = str(getattr(name, "name", name))
+            found[key], flag = _json_value(item)
+            if flag is not None:
+                found[f"{key}_flag"] = flag
+        return found, None
+    if isinstance(value, (list, tuple, set, frozenset)):
+        pairs = [_json_value(item) for item in value]
+        flags = [flag for _, flag in pairs]
+        return [item for item, _ in pairs], flags if any(flags) else None
+    if isinstance(value, float) and not math.isfinite(value):
+        return None, None if math.isnan(value) else "infinite" if value > 0 else "-infinite"
+    return value if isinstance(value, (str, bool, int, float, type(None))) else str(value), None
 
 
 # --------------------------------------------------------------------------------------------------

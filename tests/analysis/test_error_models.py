@@ -20,8 +20,8 @@ from sweep.analysis.dataset import focal_size_of, in_sight_frame, sight_rotation
 from sweep.analysis.error_models import Use
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.messages import to_json
 from sweep.report.findings import error_model_document
+from sweep.report.table import to_json
 
 SIX = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
 GRID = {"distance_m": [1.0, 1.5, 2.2, 3.3, 5.0], "tilt_deg": [0.0, 20.0, 40.0, 60.0]}

@@ -21,7 +21,7 @@ from sweep.cli.command import print_error
 from sweep.cli.parser import COMMANDS, build_parser
 from sweep.errors import ArgumentError, PipelineError, RunError, StoreError
 from sweep.measure.flags import DetectionStatus
-from sweep.messages import to_json
+from sweep.report.table import to_json
 
 TOP = Path(__file__).parents[2]
 HEAVY = ("numpy", "dask", "xarray", "numba", "cv2", "zarr", "matplotlib", "jinja2", "rich.console")

@@ -9,8 +9,8 @@ import pytest
 from support.pose_errors import poses_with_law, power_law, reader_of_the_guide
 from sweep.analysis import error_models, model_errors
 from sweep.analysis.error_models import Use
-from sweep.messages import to_json
 from sweep.report.findings import error_model_document, error_model_table
+from sweep.report.table import to_json
 
 TITLE = 'a " */ quote\\ \n #include <x> {{ 7 * 7 }} {% raw %} """ \u2028 </script> \udcff'
 ABOUT = {"store": 'runs/"odd" */ name.zarr', "title": TITLE, "fingerprint": {}}

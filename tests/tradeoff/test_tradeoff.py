@@ -16,7 +16,7 @@ from sweep.execution.status import status
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.messages import to_json
+from sweep.report.table import to_json
 from sweep.tradeoff import costs
 from sweep.tradeoff import measurement as tradeoff
 from sweep.tradeoff.costs import LEAST_ROUNDS, MIN_ROUNDS, median_interval, time_in_turns

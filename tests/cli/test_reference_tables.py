@@ -4,9 +4,9 @@ import json
 
 import sweep
 from sweep.cli import main
+from sweep.cli.reference import TABLES
 from sweep.experiment.parameters import PARAMETERS, SECTIONS
 from sweep.experiment.schema import VARIABLES
-from sweep.report.reference import TABLES
 
 
 def test_every_parameter_and_variable_stands_in_the_table_of_its_subject():

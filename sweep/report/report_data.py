@@ -517,7 +517,7 @@ class Comparison:
             cells = [words, *cells, *map(list, zip(*pairs, strict=True))]
             columns += PAIRED
             caption += (
-                f"; differences, ratios: {self.name} against each, trial by trial; verdict: each "
+                f"; differences, ratios: {self.name} against each; verdict: each "
                 "against it (equivalent: within 1 point of a rate, 5 % of an RMSE); rotation "
                 "without flips where few poses differ by them")
         return Table.of(caption, [*headings, *(each.heading for each in columns)],

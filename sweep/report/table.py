@@ -31,11 +31,15 @@ MAX_LINE_CHARS = 28
 #: Characters of a number that needs no rounding to be short.
 MAX_SHORT = 5
 
+#: Relative width of an interval below which its numbers have more than three digits, and how many
+#: they have at most.
+TIGHT, MAX_DIGITS = 0.01, 6
+
 # --------------------------------------------------------------------------------------------------
 # Numbers, coordinates and units as text.
 
 
-def number(value: float) -> str:
+def number(value: float, digits: int = 3) -> str:
     """Return a number with three significant digits and typographic signs; a dash for NaN.
 
     >>> number(0.31), number(-1234.0), number(float("inf")), number(float("nan"))
@@ -43,19 +47,19 @@ def number(value: float) -> str:
     """
     if math.isnan(value):
         return "\u2013"
-    rounded = float(f"{value:.2e}")
-    whole = rounded == 0 or 1e3 <= abs(rounded) < 1e6
-    text = f"{rounded:.0f}" if whole else f"{rounded:#.3g}".rstrip(".")
+    rounded = float(f"{value:.{digits - 1}e}")
+    whole = rounded == 0 or 10.0**digits <= abs(rounded) < 1e6
+    text = f"{rounded:.0f}" if whole else f"{rounded:#.{digits}g}".rstrip(".")
     return text.replace("inf", "\u221e").replace("-", "\u2212")
 
 
-def interval_text(low: float, high: float, unit: str = "") -> str:
-    """Return the ends of an interval: ``0.5 to 1.5``.
+def interval_text(low: float, high: float, unit: str = "", digits: int = 3) -> str:
+    """Return the ends of an interval, with so many significant digits: ``0.5 to 1.5``.
 
     >>> interval_text(1.0, float("inf"), "\u00b0")
     '1.00 to \u221e\u00b0'
     """
-    return f"{number(low)} to {number(high)}{unit}"
+    return f"{number(low, digits)} to {number(high, digits)}{unit}"
 
 
 def coordinate(value: Any) -> str:
@@ -120,9 +124,13 @@ class Value(NamedTuple):
     high: float = math.nan
 
     def __str__(self) -> str:
-        interval = "" if math.isnan(self.low) and math.isnan(self.high) else (
-            f" ({interval_text(self.low, self.high)})")
-        return number(self.value) + interval
+        if math.isnan(self.low) and math.isnan(self.high):
+            return number(self.value)
+        # As many digits as tell its ends apart: 0.9992 (0.9988 to 0.9996).
+        width, digits = (self.high - self.low) / abs(self.value or math.nan), 3
+        if 0.0 < width < TIGHT:
+            digits = min(1 - math.floor(math.log10(width)), MAX_DIGITS)
+        return f"{number(self.value, digits)} ({interval_text(self.low, self.high, '', digits)})"
 
 
 class Bin(NamedTuple):

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.dataset import DRAWS, axes_of, describes, stored_pipeline
+from sweep.analysis.dataset import DRAWS, axes_of, describes, of_cells, stored_pipeline
 from sweep.analysis.estimator import DEVIATIONS, wilson
-from sweep.errors import ArgumentError, DatasetError
+from sweep.errors import ArgumentError, DatasetError, check_positive
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import cf_attributes
@@ -121,8 +121,7 @@ def camera_calibrations(
     if coefficients not in FREE_COEFFICIENTS:
         raise ArgumentError("coefficients", coefficients,
                             f"expected one of {', '.join(map(str, FREE_COEFFICIENTS))}")
-    if not 0 < target_m < float("inf"):
-        raise ArgumentError("target_m", target_m, "expected a distance above 0 m")
+    check_positive("target_m", target_m, "expected a distance above 0 m")
     if points is None:
         points = "chessboard" if POINTS["chessboard"] in results else "markers"
     if POINTS.get(points) not in results:
@@ -145,15 +144,13 @@ def camera_calibrations(
             chosen = slice(number * counts[-1], number * counts[-1] + count)
             one = calibrate(objects[chosen], [each + offset_px for each in pixels[chosen]],
                             frame, coefficients)
-            rows.append((np.uint8(one.status), one.views, one.rms_px, one.values - truth, one.std,
-                         _position_errors(one, camera, frame, target_m)))
-    variables = {}
-    for (name, (inner, *described)), column in zip(
-            OUTPUTS.items(), map(np.array, zip(*rows, strict=True)), strict=True):
-        variables[name] = (
-            (*dims, "views", "set", *inner),
-            column.reshape(*shape, len(counts), sets, *column.shape[1:]),
-            cf_attributes(*described))
+            rows.append(dict(zip(OUTPUTS, (
+                np.uint8(one.status), one.views, one.rms_px, one.values - truth, one.std,
+                _position_errors(one, camera, frame, target_m)), strict=True)))
+    columns = of_cells(rows, [*shape, len(counts), sets])
+    variables = {
+        name: ((*dims, "views", "set", *inner), columns[name], cf_attributes(*described))
+        for name, (inner, *described) in OUTPUTS.items()}
     return xr.Dataset(
         variables,
         coords={

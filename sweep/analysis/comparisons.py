@@ -841,8 +841,6 @@ PERCENTS = {"median": 50, "p90": 90}
 #: Photographs from which errors have intervals.
 MIN_UNITS = 5
 
-SOURCES = ("photographs", "simulated")
-
 #: The dimension of photographs, or simulated scenes.
 UNIT = "unit"
 
@@ -1018,7 +1016,7 @@ def simulation_gap(
                          each, first, second, paired=paired), strict=True)}
     both = xr.concat([first.drop_dims(UNIT), second.drop_dims(UNIT)], "source", coords="minimal",
                      compat="override", join="override")
-    return both.assign(gaps).assign_coords(source=list(SOURCES)).assign_attrs(
+    return both.assign(gaps).assign_coords(source=["photographs", "simulated"]).assign_attrs(
         paired=int(paired))
 
 

@@ -6,7 +6,6 @@ import functools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from operator import attrgetter
 from typing import Any, ParamSpec, TypeVar
 
@@ -183,6 +182,18 @@ def each_cell(
         yield {dim: cell[dim].item() for dim in dims}, cell
 
 
+def of_cells(
+    rows: Sequence[Mapping[str, Any]], sizes: Sequence[int]
+) -> dict[str, NDArray[Any]]:
+    """Return arrays (*sizes, ...) by name, of a row of values for each cell, the last one fastest.
+
+    >>> of_cells([{"end": [1, 2]}, {"end": [3, 4]}], [2, 1])["end"].shape
+    (2, 1, 2)
+    """
+    columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    return {name: column.reshape([*sizes, *column.shape[1:]]) for name, column in columns.items()}
+
+
 def largest_cell(table: xr.Dataset, values: xr.DataArray) -> xr.Dataset:
     """Return the cell of a table at which values over some of its dimensions are largest."""
     index = np.unravel_index(int(np.argmax(values.to_numpy())), values.shape)
@@ -335,9 +346,6 @@ AXIS = "board_marker"
 #: Variable of boards -> its name where the markers are an axis.
 OF_MARKERS = {"marker_detection": "detection", "marker_corner_error_px": "corner_error_px"}
 
-#: Variables of the whole board that hold for each of its markers, too.
-OF_TARGETS = ("true_rvec", "true_tvec_m")
-
 
 def per_marker(results: xr.Dataset) -> xr.Dataset:
     """Return the detections of a board's markers, each marker on its own.
@@ -381,7 +389,9 @@ def per_marker(results: xr.Dataset) -> xr.Dataset:
     """
     if "marker_detection" not in results:
         raise DatasetError("no variable marker_detection: the scenes show no boards")
-    kept = [name for name in (*OF_TARGETS, "board_marker_id", *OF_MARKERS) if name in results]
+    # The pose of the whole board holds for each of its markers, too.
+    kept = [name for name in ("true_rvec", "true_tvec_m", "board_marker_id", *OF_MARKERS)
+            if name in results]
     markers = results[kept].rename({
         "marker": AXIS, **{name: new for name, new in OF_MARKERS.items() if name in kept}
     })
@@ -550,47 +560,47 @@ class Poses:
         """Poses that count at all."""
         return self._arrays.get(INSIDE, np.ones((), dtype=bool))
 
-    @cached_property
+    @functools.cached_property
     def detection(self) -> NDArray[np.uint8]:
         """Flags of `DetectionStatus`."""
         return self["detection"]
 
-    @cached_property
+    @functools.cached_property
     def estimate(self) -> NDArray[np.uint8]:
         """Flags of `EstimateStatus`."""
         return self["estimate"]
 
-    @cached_property
+    @functools.cached_property
     def run(self) -> Masks:
         """Poses that were run."""
         return is_none_of(self.detection, NOT_AVAILABLE)
 
-    @cached_property
+    @functools.cached_property
     def looked_for(self) -> Masks:
         """Poses whose detection is counted: run, visible and modelled."""
         return is_none_of(self.detection, NOT_LOOKED_FOR)
 
-    @cached_property
+    @functools.cached_property
     def detected(self) -> Masks:
         """Detected poses."""
         return np.asarray(self.detection == DetectionStatus.detected)
 
-    @cached_property
+    @functools.cached_property
     def solved(self) -> Masks:
         """Solved poses."""
         return np.asarray(self.estimate == EstimateStatus.solved)
 
-    @cached_property
+    @functools.cached_property
     def flipped(self) -> Masks:
         """Solved poses that are nearer to the mirror of the truth."""
         return np.asarray(self.solved & (self["flipped"] == Flipped.flipped))
 
-    @cached_property
+    @functools.cached_property
     def unflipped(self) -> Masks:
         """Solved poses that are not flipped."""
         return self.solved & ~self.flipped
 
-    @cached_property
+    @functools.cached_property
     def range_percent(self) -> Floats:
         """Depth error in percent of the true depth, (..., 1)."""
         return self.percent_of_depth(self["translation_error_m"][..., 2])[..., None]
@@ -607,17 +617,17 @@ class Poses:
     # Nothing cancels for small errors but the last digit of the true angle, and angles near 180
     # degrees are as exact as others (atan2). NaN if any input is.
 
-    @cached_property
+    @functools.cached_property
     def in_camera_m(self) -> Floats:
         """d, (..., xyz): the position's error along the axes of the camera."""
         return np.asarray(self["translation_error_m"], dtype=np.float64)
 
-    @cached_property
+    @functools.cached_property
     def along_marker_m(self) -> Floats:
         """Rᵀ d, (..., xyz): the position's error along the axes of the true marker."""
         return self._in_marker_frame(self.in_camera_m)
 
-    @cached_property
+    @functools.cached_property
     def of_camera_m(self) -> Floats:
         """Error (..., xyz) of the camera's position in the marker's frame.
 
@@ -627,7 +637,7 @@ class Poses:
         moved = self.in_camera_m + self._turned(self["true_tvec_m"] + self.in_camera_m, -1.0)
         return -self._in_marker_frame(moved)
 
-    @cached_property
+    @functools.cached_property
     def yaw_pitch_roll_deg(self) -> Floats:
         """Differences (..., 3) of the angles of R = Ry(yaw) · Rx(pitch) · Rz(roll) · Rx(180°).
 
@@ -635,18 +645,18 @@ class Poses:
         """
         return wrapped_deg(_angles(self._estimated) - _angles(self._rotation))
 
-    @cached_property
+    @functools.cached_property
     def tilt_deg(self) -> Floats:
         """Difference (...) of the angles between the marker's plane and the image plane."""
         optical_axis = np.array([0.0, 0.0, 1.0])
         return self._difference(optical_axis, optical_axis)
 
-    @cached_property
+    @functools.cached_property
     def viewing_angle_deg(self) -> Floats:
         """Difference (...) of the angles between the normal and the line of sight to the centre."""
         return self._difference(self["true_tvec_m"] + self.in_camera_m, self["true_tvec_m"])
 
-    @cached_property
+    @functools.cached_property
     def in_plane_deg(self) -> Floats:
         """The part of E (...) about the true normal, in [-180, 180]: its twist.
 
@@ -660,12 +670,12 @@ class Poses:
         sine = along * np.sinc(half / np.pi) / 2.0  # sin(half) / angle is sinc / 2
         return np.asarray(np.degrees(2.0 * np.arctan2(sine, np.cos(half))))
 
-    @cached_property
+    @functools.cached_property
     def _rotation(self) -> Floats:
         """R, (..., 3, 3)."""
         return rotation_of_vector(np.asarray(self["true_rvec"], dtype=np.float64))
 
-    @cached_property
+    @functools.cached_property
     def _estimated(self) -> Floats:
         """E · R, (..., 3, 3)."""
         columns = np.swapaxes(self._rotation, -1, -2)
@@ -875,9 +885,6 @@ def sampling_text(results: xr.Dataset) -> str:
 # --------------------------------------------------------------------------------------------------
 # Flags in words: the labels that a dataset's attributes give to the values of its flags.
 
-#: Label of a value that the attributes do not name.
-UNKNOWN = "unknown"
-
 
 def decode_flags(results: Labelled) -> Labelled:
     """Return results with every flag in words: ``"detected"`` in place of 1.
@@ -924,7 +931,7 @@ def _decoded(variable: xr.DataArray) -> xr.DataArray:
     values = np.atleast_1d(np.asarray(attributes.pop("flag_values", [])))
     if not meanings or len(meanings) != len(values) or variable.dtype.kind not in "uif":
         return variable
-    labels, ascending = np.array([*meanings, UNKNOWN]), np.argsort(values)
+    labels, ascending = np.array([*meanings, "unknown"]), np.argsort(values)
 
     def look_up(flags: NDArray[Any]) -> NDArray[Any]:
         flags = np.nan_to_num(flags, nan=0.0)

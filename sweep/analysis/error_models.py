@@ -705,15 +705,12 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     variables: dict[str, Any] = {"direction_weight": (
         ("direction", "condition"), directions,
         cf_attributes("weights of ln(distance), ln(side), viewing angle and bearing", ""))}
-    for name in tables[0]:
+    for name, array in dataset.of_cells(tables, [results.sizes[each] for each in kept]).items():
         ending = next((each for each in INTERVAL if each and name.endswith(each)), "")
         ending = ending if name not in VARIABLES else ""
         dims, meaning, units = VARIABLES[name.removesuffix(ending)]
-        array = np.stack([table[name] for table in tables])
-        variables[name] = (
-            (*kept, *dims),
-            array.reshape(*(results.sizes[each] for each in kept), *array.shape[1:]),
-            cf_attributes(INTERVAL[ending] + meaning, units, flags=Use if name == "use" else None))
+        variables[name] = (*kept, *dims), array, cf_attributes(
+            INTERVAL[ending] + meaning, units, flags=Use if name == "use" else None)
     coordinates: dict[str, Any] = {
         name: results[name].variable for name in kept if name in results.coords}
     coordinates |= {"quantity": list(QUANTITIES), "predictor": list(PREDICTORS),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 import math
@@ -10,7 +9,7 @@ import operator
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -20,18 +19,9 @@ from scipy import special
 
 from sweep.analysis import dataset, estimator
 from sweep.analysis.dataset import DRAWS, Poses, as_names, axes_of, describes, each_cell, stacked
-from sweep.analysis.estimator import (
-    INTERVAL,
-    LEVEL,
-    Bins,
-    Count,
-    Quantiles,
-    Rate,
-    Statistic,
-    aggregates,
-)
+from sweep.analysis.estimator import INTERVAL, LEVEL, Bins, Count, Rate, Statistic
 from sweep.analysis.summaries import LOOKED_FOR, NEES_MEAN, RATIOS, quantiles_of, registered
-from sweep.errors import ArgumentError, DatasetError
+from sweep.errors import ArgumentError, DatasetError, texts_of
 from sweep.experiment.parameters import Stage
 from sweep.experiment.sampling import RequirementText, StoppingRule, read_requirement
 from sweep.experiment.schema import cf_attributes
@@ -89,7 +79,7 @@ class Requirable:
     @property
     def exact(self) -> bool:
         """Whether the interval holds whatever the distribution."""
-        return isinstance(self.statistic, Rate | Quantiles)
+        return isinstance(self.statistic, Rate | estimator.Quantiles)
 
     @property
     def signed(self) -> bool:
@@ -106,7 +96,7 @@ class Requirable:
         Rates have Clopper and Pearson's interval.
         """
         changes: dict[str, Any] = {"exact": True} if self.is_rate else {}
-        return [dataclasses.replace(self.statistic, level=level, **changes),
+        return [replace(self.statistic, level=level, **changes),
                 Count("used", "poses that count", self.statistic.used, "draws", "drawn")]
 
     def interval(self, table: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray, xr.DataArray]:
@@ -198,14 +188,8 @@ def named(name: str) -> Requirable:
         raise ValueError(f"its unit is {UNITS[unit]}: write {stem}_{unit}")
     if kinds := [other for other in known if other.startswith(f"{stem}_")]:
         raise ValueError(f"which statistic of it? There are {', '.join(kinds)}")
-    hint = nearest(short, [*known]) or (
-        f"; there are {', '.join(EXAMPLES)} and the other variables of error_statistics, in "
-        "the guide sweep/analysis/README.md")
+    hint = nearest(short, [*known]) or "; `sweep reference statistics` lists what has"
     raise ValueError(f"nothing of this name has an interval{hint}")
-
-
-EXAMPLES = ("detection_rate", "solved_rate", "flip_rate", "rotation_p95_deg", "range_p95_percent",
-            "position_rmse_m", "yaw_bias_deg", "x_sd_m")
 
 
 def fault_of(what: Requirable, given: RequirementText) -> str:
@@ -286,8 +270,7 @@ def combined_decision(
         Decision.undecided).astype(np.uint8)
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorShares:
+class ErrorShares(NamedTuple):
     """Shares of `ERROR_PROBABILITY` that single decisions may spend.
 
     Attributes
@@ -330,6 +313,19 @@ class Requirement:
     def at_least(self) -> bool:
         """Whether the value must be large."""
         return self.relation in (">=", ">")
+
+    @property
+    def rare(self) -> float:
+        """Share of the draws that are on the wrong side where the value is the limit; NaN of means.
+
+        >>> [round(each.rare, 3) for each in parse_requirements(
+        ...     ["detection >= 0.99", "flip_rate <= 0.02", "rotation_p95_deg <= 1"])]
+        [0.01, 0.02, 0.05]
+        """
+        if not self.what.exact:
+            return math.nan
+        below = self.limit if self.what.percent is None else self.what.percent / 100.0
+        return below if self.at_least == (self.what.percent is not None) else 1.0 - below
 
     def holds(self, value: xr.DataArray) -> xr.DataArray:
         """Return where values fulfil it; NaN does not."""
@@ -466,7 +462,7 @@ def check_requirements(
 
 def decide(
     results: xr.Dataset, required: Sequence[Requirement], per: Sequence[str] = (),
-    bins: Bins | None = None, shares: ErrorShares | None = None,
+    bins: Bins | None = None, shares: Sequence[ErrorShares] | None = None,
 ) -> xr.Dataset:
     """Return decisions as `check_requirements`, without ``draws_needed``.
 
@@ -475,8 +471,8 @@ def decide(
     results, required, per, bins
         As there.
     shares
-        Shares of the error probability that a decision may spend, of all looks of a search: where
-        sampling was stopped, intervals are not widened for that again.
+        Shares of the error probability that a decision on each requirement may spend, of all looks
+        of a search: where sampling was stopped, intervals are not widened for that again.
 
     Returns
     -------
@@ -490,14 +486,15 @@ def decide(
     count = len(required) * math.prod([
         *(len(edges) - 1 for edges in (bins or {}).values()),
         *(results.sizes[name] for name in kept if name not in configuration)])
-    spent = shares or ErrorShares(not_met=1.0 / count)
+    spent = shares or [ErrorShares(not_met=1.0 / count)] * len(required)
     quantities = [each.what for each in required]
-    poses, *tables = aggregates(
+    poses, *tables = estimator.aggregates(
         results, requirable_arrays(results, quantities), kept, [
             [Count("looked_for", "", lambda poses: poses.looked_for),
              Count("solved", "", lambda poses: poses.solved)],
             *([*map(estimator.guarded, each.statistics(each.level(share)))]
-              for each in quantities for share in (spent.met, spent.not_met)),
+              for each, own in zip(quantities, spent, strict=True)
+              for share in (own.met, own.not_met)),
         ], Poses, bins, stopped=None if shares is None else False)
     lacking = [each.name for each, table in zip(quantities, tables[::2], strict=True)
                if not table["used"].any() and poses["solved"].any()]
@@ -557,15 +554,12 @@ def _judged(
 # --------------------------------------------------------------------------------------------------
 # About how many draws decide a requirement, if the value stays what it is.
 
-#: More draws than this are none that anyone waits for.
-MAX_DRAWS = 1e9
-
 #: Numbers of draws of which the first that decides a rate is taken.
 POWERS = np.unique(np.ceil(1.1 ** np.arange(1, 218)))
 
 
 def draws_needed(
-    table: xr.Dataset, required: Sequence[Requirement], share: float = 1.0
+    table: xr.Dataset, required: Sequence[Requirement], shares: Sequence[float] | None = None
 ) -> xr.DataArray:
     """Return about how many draws would decide requirements, infinite if no number would.
 
@@ -579,12 +573,13 @@ def draws_needed(
     ----------
     table, required
         The decisions (`decide`), and the requirements.
-    share
-        Share of the error probability that a decision may spend.
+    shares
+        Share of the error probability that a decision on each requirement may spend.
     """
     needed: xr.DataArray = xr.apply_ufunc(
-        np.vectorize(functools.partial(_needed, share), otypes=[float]),
-        xr.DataArray(np.array(required, dtype=object), dims="requirement"),
+        np.vectorize(_needed, otypes=[float]), *(
+            xr.DataArray(np.array(each, dtype=object), dims="requirement")
+            for each in (shares or [1.0] * len(required), required)),
         table["value"].where(table["decision"] == Decision.undecided), table["low"], table["high"],
         table["draws"].astype(np.float64),
         (table["solved"] / table["looked_for"]).where(table["looked_for"] > 0))
@@ -637,7 +632,7 @@ def _of_rate(rate: float, limit: float, level: float) -> float:
 
 def _rounded(count: float) -> float:
     """Return a number of draws with two digits, rounded up; infinite if it is too large."""
-    if count > MAX_DRAWS:
+    if count > estimator.MAX_DRAWS:
         return math.inf
     step = 10.0 ** max(0, math.floor(math.log10(max(count, 1.0))) - 1)
     return math.ceil(count / step) * step
@@ -777,8 +772,6 @@ ANGLE_AXES = ("tilt_deg", "view_angle_deg")
 #: Axes along which the size in the image changes, too.
 SIZES_BESIDE = ("size_m", "hfov_deg", "focal_length_mm", "fx_px", "width_px")
 
-IDS = "marker_id"
-
 #: Sections of which an axis without numbers has targets: dictionaries, boards.
 TARGETS = {"marker", "board"}
 
@@ -811,8 +804,8 @@ def conditions(
         return found
     axes = [name for name in axes_of(results, Stage.scene)
             if name != DRAWS and results.sizes[name] > 1]
-    numeric = [name for name in axes if name in results.coords and name not in (IDS, *ANGLE_AXES)
-               and results[name].dtype.kind in "fiu"]
+    numeric = [name for name in axes if name in results.coords
+               and name not in ("marker_id", *ANGLE_AXES) and results[name].dtype.kind in "fiu"]
     targets = [name for name in axes if results[name].dtype.kind not in "fiu"
                and not TARGETS.isdisjoint(dataset.sections_of(name, results))]
     usual = [next((name for name in names if name in axes), "") for names in (
@@ -903,17 +896,29 @@ def of_values(decision: Decisions, keeps: Masks) -> tuple[Decisions, Masks]:
         (keeps | (decision == Decision.not_applicable)).all(inner))
 
 
-def error_shares(looks: float, decisions: int) -> ErrorShares:
-    """Return the shares of the error probability that each decision of a search may spend.
+def search_shares(
+    required: Sequence[Requirement], ends: Sequence[int], values: int, alternatives: int = 1
+) -> list[ErrorShares]:
+    """Return the shares of the error probability that decisions of a search may spend.
 
     Parameters
     ----------
-    looks
-        How often an answer can be wrong: looks after each wave, and alternatives.
-    decisions
-        How many decisions are made at once for one answer: any false "not met" shortens it.
+    required
+        The requirements: each has shares of its own.
+    ends
+        Draws of a cell at each look.
+    values
+        Cells that are decided at once for one answer: any false "not met" shortens it.
+    alternatives
+        Answers, each of which can be wrong.
     """
-    return ErrorShares(met=1.0 / looks, not_met=1.0 / (looks * decisions))
+    def share(requirement: Requirement, side: float, count: int) -> float:
+        error = (1.0 - requirement.what.level(1.0 / count)) / 2.0
+        return 1.0 / (count * estimator.looks_factor(tuple(ends), side, error))
+
+    return [ErrorShares(share(each, 1.0 - each.rare, alternatives),
+                        share(each, each.rare, alternatives * values * len(required)))
+            for each in required]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -1022,18 +1027,15 @@ def requirement_limits(
     >>> limit["limited_by"].item(), limit["fails_at"].item()
     ('detection_rate >= 0.6', 10.0)
     """
-    rule, looks = dataset.stopping_rule(results), 1
+    rule = dataset.stopping_rule(results)
+    ends: tuple[int, ...] = (results.sizes.get(DRAWS, 1),)
     if rule is not None and rule.kind == "along":
-        looks = len(rule.ends)
+        ends = rule.ends
         require, along = require or rule.requirements, along or rule.along
         if along == rule.along:
             per = rule.per if per is None else per
             at_all = rule.at_all if at_all is None else at_all
-    require = [require] if isinstance(require, str) and require else require
-    if not require:
-        raise ArgumentError("require", "", "expected what must hold, such as 'detection >= 0.9'")
-    if not along:
-        raise ArgumentError("along", "", "expected the axis that is searched, such as distance_m")
+    require = texts_of("require", require or ())
     required = parse_requirements(require)
     require_order(results, along)
     together = [name for name in as_names(at_all or ()) if name != along]
@@ -1041,9 +1043,10 @@ def requirement_limits(
              if name != along and (per is not None or name not in (DRAWS, *together))]
     if overlap := [name for name in together if name in names]:
         raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
-    count = len(required) * math.prod(results.sizes.get(name, 1) for name in (along, *together))
-    table = decide(results, required, [*names, *together, along],
-                   shares=error_shares(estimator.looks_factor(looks), count))
+    pooled = cells_along(results, {*axes_of(results, Stage.scene)} - {
+        DRAWS, along, *names, *together})
+    table = decide(results, required, [*names, *together, along], shares=search_shares(
+        required, [end * pooled for end in ends], cells_along(results, (along, *together))))
     table = table.sortby(along)
     upwards = is_harder_upwards(along, table["keeps"].transpose(along, ...).to_numpy())
     table = table.isel({along: slice(None, None, 1 if upwards else -1)})
@@ -1051,12 +1054,8 @@ def requirement_limits(
     kept = [str(dim) for dim in table["decision"].dims if dim not in inner]
     rows = [_limit(part.transpose(along, ...), along, together, upwards=upwards)
             for _, part in each_cell(table, kept)]
-    columns = {}
-    for name in rows[0]:
-        column = np.array([row[name] for row in rows])
-        rest = column.shape[1:]  # along the axis, if it has values there
-        columns[name] = ([*kept, along][: len(kept) + len(rest)],
-                         column.reshape([*(table.sizes[dim] for dim in kept), *rest]))
+    columns = {name: ([*kept, along][: column.ndim], column) for name, column in dataset.of_cells(
+        rows, [table.sizes[dim] for dim in kept]).items()}
     computed = dataset.computed_scenes(results)
     cells = [name for name in computed.dims if name not in (*names, along, DRAWS)]
     trials = computed.sum(DRAWS).compute()
@@ -1070,7 +1069,12 @@ def requirement_limits(
     return found.assign_attrs(
         along=along, harder="upwards" if upwards else "downwards",
         configuration_dims=table.attrs["configuration_dims"],
-        per=[*names], at_all=together, require=[*require])
+        per=[*names], at_all=together, require=require)
+
+
+def cells_along(results: xr.Dataset, names: Iterable[str]) -> int:
+    """Return how many combinations the values of some dimensions have; others are none."""
+    return math.prod(results.sizes.get(name, 1) for name in names)
 
 
 def require_order(results: xr.Dataset, along: str) -> None:
@@ -1257,7 +1261,9 @@ class Answer:
 CHOICE = "choice"
 
 
-def choice_table(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -> xr.Dataset:
+def choice_table(
+    results: xr.Dataset, rule: StoppingRule, shares: Sequence[ErrorShares]
+) -> xr.Dataset:
     """Return the decisions that make a choice, of a whole store or of some of its alternatives.
 
     Returns
@@ -1277,8 +1283,7 @@ def choice_table(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -
         table.expand_dims(CHOICE))
     table = table.transpose(*rule.among, rule.along or CHOICE, *rule.at_all, "requirement")
     # Where so few poses count that max_trials will not have enough, there is nothing to learn.
-    pooled = math.prod(results.sizes[name] for name in axes_of(results, Stage.scene)
-                       if name not in (*kept, DRAWS))
+    pooled = cells_along(results, {*axes_of(results, Stage.scene)} - {*kept, DRAWS})
     coming = table["draws"] / table["looked_for"] * rule.max_trials * pooled
     few = (table["looked_for"] >= MIN_DRAWS) & (coming < MIN_DRAWS)
     return table.assign(hopeless=few & (table["decision"] == Decision.undecided))
@@ -1297,11 +1302,13 @@ def choice_needed(table: xr.Dataset, rule: StoppingRule) -> xr.DataArray:
     return wanted if rule.along else wanted.isel({CHOICE: 0})
 
 
-def answers(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -> list[Answer]:
+def answers(
+    results: xr.Dataset, rule: StoppingRule, shares: Sequence[ErrorShares]
+) -> list[Answer]:
     """Return the answer of each alternative, in the order of the axes ``among``."""
     table = choice_table(results, rule, shares)
     table = table.assign(draws_needed=draws_needed(
-        table, parse_requirements(rule.requirements), shares.met))
+        table, parse_requirements(rule.requirements), [each.met for each in shares]))
     return [_answer(*part, rule) for part in each_cell(table, rule.among)]
 
 
@@ -1534,7 +1541,7 @@ def precision_reached(
         raise ArgumentError("wanted", wanted, "\n".join(faults))
     configuration = dataset.configuration_axes(results)
     kept = dataset.kept_dimensions(results, (*configuration, *as_names(per)))
-    poses, *tables = aggregates(
+    poses, *tables = estimator.aggregates(
         results, requirable_arrays(results, [each.what for each in precisions]), kept, [
             [Count(*LOOKED_FOR, lambda poses: poses.looked_for),
              Count("run", "poses that were run", lambda poses: poses.run),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from operator import attrgetter
 from typing import Any
 
@@ -764,7 +763,7 @@ def ambiguity_ratio(reprojection_px: ArrayLike, alternative_px: ArrayLike) -> Fl
 class AmbiguousPoses(Poses):
     """Poses of a block with the ratios of their reprojection errors."""
 
-    @cached_property
+    @functools.cached_property
     def ratio(self) -> Floats:
         """Ratios (groups, cells, draws, settings), as `ambiguity_ratio` defines them."""
         return ambiguity_ratio(

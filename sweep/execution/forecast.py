@@ -23,7 +23,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildError, default_workers
 from sweep.isolation.watchdog import compilation_s
 from sweep.messages import duration
-from sweep.sampling.rules import Stopping, block_unit, make_rule
+from sweep.sampling.rules import Stopping, make_rule
 from sweep.store.locations import is_remote
 
 # --------------------------------------------------------------------------------------------------
@@ -229,7 +229,7 @@ def _cut(axes: Sequence[Axis], target: int, rule: Stopping | None) -> tuple[int,
     extents = [1] * len(axes)
     if rule is not None:
         trial = order.pop()
-        unit = block_unit(rule.ends)
+        unit = rule.ends[0]
         extents[trial] = max(k for k in range(1, min(unit, target) + 1) if unit % k == 0)
         order.sort(key=lambda k: axes[k].name not in rule.coupled)
         if extents[trial] < unit:

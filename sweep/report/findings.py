@@ -519,7 +519,7 @@ def gap_table(gap: xr.Dataset) -> Table:
             for group, (_, one) in zip(groups, dataset.each_cell(gap, dims), strict=True)]
     return Table.of(
         "Photographs and simulation, with 95 % intervals of the gap: the difference, or the ratio",
-        ["statistic", *dims, *comparisons.SOURCES, "compared by", "gap"], rows, stub=1 + len(dims))
+        ["statistic", *dims, *gap["source"].data, "compared by", "gap"], rows, stub=1 + len(dims))
 
 
 def gap_lines(gap: xr.Dataset) -> list[str]:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
@@ -32,15 +30,6 @@ from sweep.typing import Masks
 # speed some values of the others, which must not influence each other. A part of a group of which
 # no cell is needed in a wave is settled for good.
 
-def block_unit(ends: Sequence[int]) -> int:
-    """Return the largest number of trials that divides the ends of all waves but the last.
-
-    >>> block_unit((50, 100, 120)), block_unit((30,))
-    (50, 30)
-    """
-    return math.gcd(*ends[:-1]) if len(ends) > 1 else ends[0]
-
-
 @dataclass(frozen=True, slots=True)
 class Stopping:
     """A rule of stopping for one pipeline.
@@ -48,7 +37,8 @@ class Stopping:
     Attributes
     ----------
     ends
-        Numbers of trials at which waves end, increasing; the last one is ``max_trials``.
+        Numbers of trials at which waves end, increasing, multiples of the first; but the last one
+        is ``max_trials``.
     variables
         The dataset's variables that it reads.
     coupled
@@ -192,7 +182,7 @@ class Decider:
     @staticmethod
     def of(store: RunStore, rule: StoppingRule) -> Decider:
         """Return the decider by a rule on the blocks of a store."""
-        pipeline = dataclasses.replace(store.pipeline, stopping=rule)
+        pipeline = replace(store.pipeline, stopping=rule)
         sampling = make_rule(pipeline)
         assert sampling is not None  # noqa: S101  (there is a rule)
         return Decider(store, sampling, Waves.of(pipeline, sampling, store.blocks))

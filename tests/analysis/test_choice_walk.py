@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sweep.analysis.requirements import Decision, combined_decision, course, error_shares, needed
+from sweep.analysis import requirements
+from sweep.analysis.requirements import Decision, combined_decision, course, needed
 from sweep.experiment.sampling import wave_ends
 
 ENDS = wave_ends(5000, 50)
@@ -24,7 +25,8 @@ def decided(hits, n, limit, shares):
 def search(rates, limit, generator):
     """Return decisions, whether estimates keep the limit, and trials of a search (A, V, C)."""
     alternatives, values, conditions = rates.shape
-    shares = error_shares(len(ENDS) * alternatives, values * conditions)
+    required = requirements.parse_requirements(f"detection >= {limit}")
+    shares, = requirements.search_shares(required, ENDS, values * conditions, alternatives)
     n = np.zeros(rates.shape, int)
     hits = np.zeros(rates.shape, int)
     asked = np.ones(rates.shape, bool)

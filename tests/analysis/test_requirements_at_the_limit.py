@@ -7,10 +7,13 @@ that is promised.
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy import stats
 
 from support.small_datasets import perfect
+from sweep.analysis import requirements
 from sweep.analysis.requirements import ERROR_PROBABILITY, Decision, check_requirements
+from sweep.experiment.sampling import wave_ends
 from sweep.measure.flags import EstimateStatus, Flipped
 
 pytestmark = pytest.mark.evidence
@@ -82,6 +85,20 @@ def test_what_is_at_the_limit_is_rarely_met(draw, required, draws, chance, claim
               "2,000 simulated stores; 5 % are allowed", 100 * count / SIMULATIONS, "%")
         assert count <= stats.binom.isf(1e-6, SIMULATIONS, chance)
         assert count < ERROR_PROBABILITY * SIMULATIONS
+
+
+@pytest.mark.parametrize(("draw", "text"), [
+    *((solved(rate), f"solved >= {rate}") for rate in (0.9, 0.99)),
+    (errors(lambda rng, shape: rng.exponential(size=shape)), f"rotation_p95_deg <= {P95:.12g}")])
+def test_at_no_look_of_a_search_it_is_falsely_decided(draw, text):
+    results, ends = draw(np.random.default_rng(5), 600), wave_ends(600, 40)
+    required = requirements.parse_requirements(text)
+    shares = requirements.search_shares(required, ends, 1)
+    looks = xr.concat([requirements.decide(results.isel(trial=slice(end)), required, shares=shares)
+                       ["decision"] for end in ends], "look")
+    for decision in (Decision.met, Decision.not_met):
+        count = int((looks == decision).any("look").sum())
+        assert 0 < count <= stats.binom.isf(1e-6, SIMULATIONS, 0.025)
 
 
 def test_not_met_at_any_of_many_conditions_is_rarely_false():

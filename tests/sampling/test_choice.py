@@ -111,6 +111,6 @@ def test_what_too_few_poses_have_a_number_of_is_given_up(most, hopeless):
     results["estimate"].values[:, 1:] = EstimateStatus.solver_failed
     rule = StoppingRule(kind="smallest", along="side_px", max_trials=most, unit=50,
                         requirements=("rotation_rmse_deg <= 5",))
-    table = choice_table(results, rule, ErrorShares(met=0.1, not_met=0.05))
+    table = choice_table(results, rule, [ErrorShares(met=0.1, not_met=0.05)])
     assert table["hopeless"].all() == hopeless
     assert bool(choice_needed(table, rule).any()) != hopeless

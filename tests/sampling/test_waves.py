@@ -9,7 +9,7 @@ import pytest
 from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import wave_ends
-from sweep.sampling.rules import Waves, block_unit, make_rule
+from sweep.sampling.rules import Waves, make_rule
 
 TEXT = """
 seed = 3
@@ -37,7 +37,7 @@ def test_waves_end_at_multiples_of_their_unit_and_grow_by_a_quarter(most, unit):
     assert all(step <= max(unit, end / 4 + unit) for end, step in zip((0, *ends), steps,
                                                                       strict=False))
     assert len(ends) <= 12 + 4 * math.log(most / unit) if most > unit else len(ends) == 1
-    assert all(end % block_unit(ends) == 0 for end in ends[:-1])
+    assert all(end % ends[0] == 0 for end in ends[:-1])
 
 
 @pytest.mark.parametrize("extents", [(1, 1, 25), (2, 1, 5), (1, 2, 25), (2, 3, 1)])

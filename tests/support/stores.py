@@ -11,7 +11,7 @@ import zarr
 from sweep.execution.block_task import compute_block
 from sweep.execution.waves import InWaves
 from sweep.experiment.grid import TRIAL
-from sweep.sampling.rules import block_unit, make_rule
+from sweep.sampling.rules import make_rule
 from sweep.store.lifecycle import CHECKSUM, _checksum, _sealed, create_store
 
 GRID = """
@@ -36,7 +36,7 @@ def by_hand(url, pipeline, extents=None, numbers=None):
     """
     rule = make_rule(pipeline)
     lengths = tuple(
-        block_unit(rule.ends) if rule and axis.name == TRIAL else len(axis)
+        rule.ends[0] if rule and axis.name == TRIAL else len(axis)
         for axis in pipeline.experiment.scene_axes
     )
     store = create_store(url, pipeline, extents or lengths)

@@ -115,9 +115,3 @@ def test_what_cannot_be_judged_is_left_out():
     assert needed(decision, keeps).nonzero()[0].tolist() == [4]
     nothing = column([NONE], [NONE])
     assert course(nothing, nothing == MET)[::3] == (-1, 2)
-
-
-@pytest.mark.parametrize(("decisions", "expected"), [
-    ([MET, MET], (1, 1, 1, 2, 2)), ([FAILED, MET], (-1, -1, -1, 0, 0))])
-def test_all_met_has_no_next_and_none_met_has_no_answer(decisions, expected):
-    assert course(column(*decisions), column(*decisions) == MET) == expected

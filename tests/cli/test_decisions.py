@@ -78,16 +78,6 @@ def test_the_status_is_that_of_the_decision(arguments, status, require):
         assert "draws, about" in out
 
 
-def test_json_is_one_object(require):
-    code, out, err = require("two.zarr", "rotation_p95_deg <= 3", "--json")
-    found = json.loads(out)
-    assert (code, err) == (1, "")
-    assert found["decision"] == "not_met"
-    worst = found["requirements"][0]
-    assert (worst["value"], worst["value_flag"]) == (None, "infinite")
-    assert worst["condition"] == {"side_px": 11.0}
-
-
 def test_a_store_is_worse_than_another_and_not_than_itself(folder, require):
     noisy = Pipeline.from_text(TEXT, ["noise_grey=8", "blur_px=1.5"])
     close(by_hand(str(folder / "noisy.zarr"), noisy))

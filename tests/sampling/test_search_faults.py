@@ -21,7 +21,6 @@ def faults_of(**change):
     ({"search": {"smallest": "dictionary", "among": []}}, "expected an axis of several numbers"),
     ({"search": {"smallest": "size"}}, "size: no such axis; did you mean size_m?"),
     ({"search": {"largest": "size_m"}}, "precision, not smallest and largest"),
-    ({"search": {"among": "dictionary"}}, 'a list of texts, such as ["dictionary", "solver"]'),
     ({"search": {"max_trials": 30}}, "search.max_trials = 30: expected at least "),
     ({"axes": {"size_m": [0.02]}}, "an axis of several numbers, from easy to hard"),
     ({"search": {"smallest": "distance_m"}, "pose": {"distance_m": {"uniform": [1, 2]}}},
@@ -31,7 +30,6 @@ def faults_of(**change):
     ({"require": {"all": ["budget_ms <= 2"]}, "search": None}, "is the time of a choice"),
     ({"sampling": "sobol"}, "expected independent beside [search]"),
     ({"search": LIMIT | {"per": ["nothing"]}}, "no such axis"),
-    ({"search": LIMIT | {"among": ["solver"]}}, "beside smallest"),
     ({"search": PRECISION | {"precision": {"detection_rate": 0.1, "detection": 0.2}}},
      "another half-width"),
 ])

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.polynomial.chebyshev import chebvander
 from scipy import special
 from scipy.linalg import block_diag
 
@@ -95,32 +96,21 @@ def estimate(values: Floats) -> Estimate:
     return Estimate(mean, mean - half, mean + half)
 
 
-def jackknife(function: Callable[[Integers], Floats], count: int) -> list[Estimate]:
-    """Return estimates of a function (k,) of photographs, by leaving each of them out.
-
-    ``function`` takes the numbers of the photographs that count. Pseudo-values give the interval
-    (Efron and Stein, "The jackknife estimate of variance", Annals of Statistics 9, 1981).
-    """
-    every = np.arange(count)
-    whole = function(every)
-    if count < MIN_PHOTOGRAPHS:
-        return [Estimate(value) for value in whole.tolist()]
-    without = np.array([function(np.delete(every, k)) for k in range(count)])
-    spread = [estimate(each) for each in (count * whole - (count - 1) * without).T]
-    return [
-        Estimate(value, value + each.low - each.value, value + each.high - each.value)
-        for value, each in zip(whole.tolist(), spread, strict=True)
-    ]
-
-
 # --------------------------------------------------------------------------------------------------
 # A Gaussian field of shifts, of covariance s² exp(-d² / (2 l²)), as ``edge_px`` and ``geometry_px``
 # in scenes.
 #
 # Two sums of a photograph's squares or products of shifts say s and l (the method of moments). The
-# farther the field reaches, the larger is the second one beside the first. The reciprocals of s
-# and l have the jackknife's intervals: of few photographs they are less skew than s and l, and
-# an upper end of infinity is one that they do not limit.
+# farther the field reaches, the larger is the second one beside the first. Estimates of s and l
+# from few photographs are skew, but what each photograph's sums exceed their expectations by has
+# the mean 0 at the true s and l: the intervals hold those values for which Hotelling's statistic
+# of these means does not exclude 0, whatever the other one (Hansen, Heaton and Yaron,
+# "Finite-sample properties of some alternative GMM estimators", 1996). They have no end where pose
+# or noise hide the field.
+
+#: Variances that are compared, over one that is about as large as the sums say.
+VARIANCES = np.geomspace(1e-3, 1e3, 700)
+
 
 class Field(NamedTuple):
     """A field of shifts: standard deviation, correlation length, and whether there is one.
@@ -132,45 +122,58 @@ class Field(NamedTuple):
     length_px: Estimate = Estimate()
     variance: Estimate = Estimate()
 
-    def covariance(self, distances: Floats, cell_px: float) -> Floats:
-        """Return the covariance in px² of means over cells at squared distances (px²).
 
-        Means over two squares are, nearly, the field smoothed by a Gaussian of their variance.
-        """
-        if not self.variance.value > 0:
-            return np.zeros_like(distances)
-        square = self.length_px.value**2
-        wide = square + cell_px**2 / 6
-        return np.asarray(
-            self.size_px.value**2 * square / wide * np.exp(-0.5 * distances / wide)
-        )
+def field_of(sums: Floats, shares: Floats, lengths_px: Floats) -> Field:
+    """Return the field that photographs' two sums of squares show.
 
-
-def field_of(photographs: Sequence[tuple[Floats, Floats]], lengths_px: Floats) -> Field:
-    """Return the field that has each photograph's two sums (2,) of squares, px².
-
-    Beside them there are the sums (2, L) expected of fields of standard deviation 1 px, and of L
-    correlation lengths; the second over the first one rises with the length.
+    Parameters
+    ----------
+    sums
+        (n, 2) of n photographs, px².
+    shares
+        (n, 2, L) those expected of fields of standard deviation 1 px and of L correlation lengths;
+        the second over the first one rises with the length.
+    lengths_px
+        (L,) these lengths.
     """
-    at = np.log(lengths_px)
-    sums, shares = (np.array(each) for each in zip(*photographs, strict=True))
-
-    def matched(rows: Integers) -> Floats:
-        """Return minus the reciprocals of standard deviation and length, (2,)."""
-        found, expected = sums[rows].sum(axis=0), shares[rows].sum(axis=0)
-        rising = np.maximum.accumulate(expected[1] / expected[0])
-        length = float(np.interp(found[1] / max(found[0], 1e-12), rising, at))
-        total = np.interp(length, at, expected.sum(axis=0))
-        return -np.array([math.sqrt(total / max(float(found.sum()), 1e-12)), math.exp(-length)])
-
-    size, length = (
-        each.mapped(lambda inverse: math.inf if inverse >= 0 else -1 / inverse)
-        for each in jackknife(matched, len(sums))
+    at, found, expected = np.log(lengths_px), sums.sum(axis=0), shares.sum(axis=0)
+    rising = np.maximum.accumulate(expected[1] / expected[0])
+    length = float(np.interp(found[1] / max(found[0], 1e-12), rising, at))
+    total = np.array([np.interp(length, at, each.sum(axis=0)) for each in shares])
+    size, ends = math.sqrt(max(float(found.sum() / total.sum()), 0.0)), [(math.nan, math.nan)] * 2
+    if len(sums) >= MIN_PHOTOGRAPHS:
+        variances = VARIANCES * abs(sums).sum() / total.sum()
+        misfit = _misfit(sums, shares, variances)
+        limit = float(special.stdtrit(len(sums) - 2, 1 - TAIL)) ** 2
+        ends = [_ends(np.sqrt(variances), misfit.min(axis=1) <= limit),
+                _ends(lengths_px, misfit.min(axis=0) <= limit)]
+    return Field(
+        Estimate(size, *ends[0]), Estimate(math.exp(length), *ends[1]),
+        estimate(sums.sum(axis=1) / total.mean()),
     )
-    if np.isclose(length.value, lengths_px[[0, -1]]).any():  # Beyond, maybe: without an interval.
-        length = Estimate(length.value)
-    expected = [np.interp(math.log(length.value), at, each.sum(axis=0)) for each in shares]
-    return Field(size, length, estimate(sums.sum(axis=1) / expected))
+
+
+def _misfit(sums: Floats, shares: Floats, variances: Floats) -> Floats:
+    """Return Hotelling's statistic (V, L) of what the sums (n, 2) exceed their expectations by.
+
+    Those are the shares (n, 2, L) of L correlation lengths times each of the variances (V,).
+    """
+    count, v = len(sums), variances[:, None, None, None]
+    a, x = sums - sums.mean(axis=0), shares - shares.mean(axis=0)
+    cross = np.einsum("ni,njl->lij", a, x)
+    scatter = a.T @ a - v * (cross + cross.swapaxes(1, 2)) + v**2 * np.einsum("nil,njl->lij", x, x)
+    excess = (sums.mean(axis=0) - v[..., 0] * shares.mean(axis=0).T)[..., None]
+    solved = np.linalg.solve(scatter / (count * (count - 1)), excess)
+    return np.asarray((excess * solved).sum(axis=(2, 3)))
+
+
+def _ends(values: Floats, inside: Masks) -> tuple[float, float]:
+    """Return the nearest of rising values around those that are inside, 0 and infinity beyond.
+
+    NaN where none is: no field of these lengths has such sums.
+    """
+    around, at = np.array([0.0, *values, math.inf]), np.flatnonzero(inside)
+    return (float(around[at[0]]), float(around[at[-1] + 2])) if len(at) else (math.nan, math.nan)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -192,7 +195,7 @@ REACH_MODULES, ALONG_MODULES = 0.5, 0.4
 STEP_SHARE = 0.6
 
 #: Correlation lengths that are compared, in modules.
-EDGE_LENGTHS = np.geomspace(0.25, 3.0, 40)
+EDGE_LENGTHS = np.geomspace(0.25, 3.0, 60)
 
 #: Lines of modules between edges of both directions, which are taken for independent.
 FAR = 1000
@@ -202,8 +205,15 @@ def edge_field(fits: Sequence[PhotographFit]) -> Field:
     """Return the field of shifts of edges in photographs."""
     known = [edge_sums(fit) for fit in fits if np.isfinite(fit.noise).any()]
     known = [each for each in known if each[1].any()]
-    module_px = np.mean([state.marker.module_px for fit in fits for state in fit.states])
-    return field_of(known, EDGE_LENGTHS * module_px) if known else Field()
+    if not known:
+        return Field()
+    sums, shares = map(np.array, zip(*known, strict=True))
+    return field_of(sums, shares, EDGE_LENGTHS * module_px(fits))
+
+
+def module_px(fits: Sequence[PhotographFit]) -> float:
+    """Return the mean length of a module in photographs."""
+    return float(np.mean([state.marker.module_px for fit in fits for state in fit.states]))
 
 
 def edge_sums(fit: PhotographFit) -> tuple[Floats, Floats]:
@@ -281,69 +291,65 @@ def _edges_along(state: MarkerState, axis: int) -> tuple[Any, ...]:
 # Shifts of markers beside the camera's model: how large they are, and how far they reach.
 #
 # The fitted corners of a photograph's markers minus the corners of the board's pose, which is
-# fitted to them, are (1 - P) (shifts + noise), P being the projection on the changes by a pose. The
-# two sums of squares are those of their corners beside the centres, which turn a pose, and of the
-# markers' centres.
+# fitted to them, are (1 - P) (shifts + noise), P being the projection on the changes by a pose and
+# by the print's size. The two sums of squares are those of their corners beside the centres, which
+# turn a pose, and of the markers' centres.
 
-#: Correlation lengths that are compared, as shares of the frame's width. A pose takes up most of
-#: longer ones: their size cannot be said.
-LENGTHS = np.geomspace(0.01, 0.4, 24)
+#: Correlation lengths that are compared, from so many modules to a share of the frame's width.
+#: A pose takes up most of longer ones: their size cannot be said.
+SHORTEST_MODULES, LONGEST_SHARE = 1.5, 0.4
 
-#: Cells along each side of a marker in which the field is taken as constant.
-CELLS = 6
+#: Chebyshev's nodes along each side of a marker, at which fields of such lengths say all others.
+NODES = 6
 
 #: Markers of a photograph from which their shifts are seen beside the pose's.
 MIN_SHIFTED_MARKERS = 3
 
 
-def geometry_field(fits: Sequence[PhotographFit], edges: Field, scale: float) -> Field:
+def geometry_field(fits: Sequence[PhotographFit], edges: Field) -> Field:
     """Return the field of shifts of markers; nothing with too few photographs that say it.
 
-    Parameters
-    ----------
-    fits
-        Of the photographs.
-    edges
-        Shifts of single edges, which move corners as noise does.
-    scale
-        Size of the markers over the board's.
+    ``edges`` are shifts of single edges, which move corners as noise does.
     """
-    lengths = LENGTHS * fits[0].states[0].marker.shown.width_px
+    lengths = np.geomspace(
+        SHORTEST_MODULES * module_px(fits), LONGEST_SHARE * fits[0].states[0].marker.shown.width_px,
+        60)
     known = [
         _geometry_sums(fit, edges, *beside, lengths) for fit in fits
         if len(fit.states) >= MIN_SHIFTED_MARKERS and np.isfinite(fit.noise).any()
-        and (beside := _beside_truth(fit.states, scale)) is not None
+        and (beside := _beside_truth(fit.states)) is not None
     ]
-    return field_of(known, lengths) if len(known) >= MIN_PHOTOGRAPHS else Field()
+    if len(known) < MIN_PHOTOGRAPHS:
+        return Field()
+    sums, shares = map(np.array, zip(*known, strict=True))
+    return field_of(sums, shares, lengths)
 
 
-def _beside_truth(
-    states: Sequence[MarkerState], scale: float
-) -> tuple[Floats, Floats] | None:
+def _beside_truth(states: Sequence[MarkerState]) -> tuple[Floats, Floats] | None:
     """Return the shifts (8 n,) of corners beside the truth, and how they change with it (8 n, k).
 
-    Poses of a file are exact: k = 0. Otherwise it is one pose of the board, fitted to all corners,
-    whose markers are ``scale`` times as large as its file says; None without such a pose.
+    It has the print's size, and, unless a file's poses are exact, one pose of the board, fitted to
+    all corners; None without such a pose.
     """
     places = [state.marker.shown for state in states]
+    shifts = np.concatenate([state.shifts for state in states])
+    quads = np.array([state.marker.corners_px for state in states])
+    size = (quads - quads.mean(axis=1, keepdims=True)).reshape(-1, 1)
     if places[0].source == TruthSource.poses_file:
-        shifts = np.concatenate([state.shifts.ravel() for state in states])
-        return shifts, np.empty((len(shifts), 0))
+        return shifts.ravel(), size
     corners = np.array([
         each.on_board.board.corners_m[each.on_board.number] for each in places if each.on_board
     ])
-    centres = corners.mean(axis=1, keepdims=True)
-    points = (centres + scale * (corners - centres)).reshape(-1, 3)
-    pixels = np.concatenate([
-        state.marker.corners_px + state.shifts + state.marker.frame_px for state in states
-    ])
+    frames_px = np.array([[state.marker.frame_px] for state in states])
+    pixels = (quads + frames_px).reshape(-1, 2) + shifts
+    points = corners.reshape(-1, 3)
     first, used = places[0], np.ones(len(points), dtype=bool)
     start = of_board(first.rotation, first.translation, marker_frame(corners[0])[1])
     pose = cameras.fit_pose(first.camera, points, pixels, *start, used)
     if pose is None:
         return None
     _, explained, _ = cameras.derivatives(first.camera, points, pose.rotation, pose.translation)
-    return -pose.residuals.ravel(), explained
+    return -pose.residuals.ravel(), np.hstack([explained, size])
 
 
 def _geometry_sums(
@@ -359,58 +365,50 @@ def _geometry_sums(
     residual = np.eye(size) - q @ q.T
     centres = np.kron(np.eye(count), np.tile(np.eye(2), 4) / 2)
     parts = (residual - centres.T @ centres @ residual, centres @ residual)
-    forms = [part.T @ part for part in parts]
-    noises, points, *moved = (np.array(each) for each in zip(
-        *(_corners(state, fit.noise) for state in fit.states), strict=True
-    ))
-    every = points.reshape(-1, 2)
-    distances = ((every[:, None] - every[None]) ** 2).sum(axis=2)
-
-    def sums(covariance: Floats, noise: Floats | float = 0.0) -> Floats:
-        """Return the expected share of a field of shifts, and noise, in both sums of squares."""
-        # Corners move with the cells of their own marker: products marker by marker.
-        rows = covariance.reshape(count, -1, len(every))
-        shifted = np.hstack(sum(
-            (each @ rows).reshape(size, count, -1).swapaxes(0, 1) @ each.swapaxes(1, 2)
-            for each in moved
-        ))
-        return np.array([float((form * (shifted + noise)).sum()) for form in forms])
-
-    cells_px = [each.marker.modules * each.marker.module_px / CELLS for each in fit.states]
-    of_edges = edges.covariance(distances, float(np.mean(cells_px)))
-    added = sums(of_edges, block_diag(*noises))
-    return np.array([shifts @ form @ shifts for form in forms]) - added, np.stack([
-        sums(np.exp(-0.5 * distances / length**2)) for length in lengths_px
-    ], axis=1)
+    variance = float(np.nanmean(fit.noise)) + QUANTISATION_VARIANCE
+    own, points, *moved = zip(*(_corners(state, variance, edges) for state in fit.states),
+                              strict=True)
+    every = np.concatenate(points)
+    squares = ((every[:, None] - every[None]) ** 2).sum(axis=2)
+    covariance, right, down = (block_diag(*each) for each in (own, *moved))
+    sums, shares = [], []
+    for form in (part.T @ part for part in parts):
+        at_nodes = right.T @ form @ right + down.T @ form @ down
+        sums.append(shifts @ form @ shifts - (form * covariance).sum())
+        shares.append([(at_nodes * np.exp(-0.5 * squares / each**2)).sum() for each in lengths_px])
+    return np.array(sums), np.array(shares)
 
 
-def _corners(state: MarkerState, noise: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def _corners(state: MarkerState, variance: float, edges: Field) -> tuple[Floats, ...]:
     """Return how a marker's fitted corners follow from its pixels.
 
-    Their covariance (8, 8), x and y in turn, by the pixels' ``noise`` (2,), the variances on black
-    and white, px². Points (n, 2) in px of the frame, and weights (8, n) for right and for down:
-    what shifts there add to the corners.
+    Their covariance (8, 8), x and y in turn, by the pixels' ``variance`` and by the shifts of
+    single edges, px², which do not reach from marker to marker. Nodes (n, 2) in px of the frame,
+    and what a smooth field's shifts right and down there add, each (8, n).
     """
-    marker = state.marker
-    own = state.jacobian[:, :OWN]
+    marker, own = state.marker, state.jacobian[:, :OWN]
     influence = own @ np.linalg.pinv(products(own), hermitian=True)[:, :CORNERS]
-    black, white = np.where(np.isfinite(noise), noise, noise[::-1])
-    share = np.clip(state.share, 0.0, 1.0)
-    variance = np.maximum((1 - share) * black + share * white, 0.0) + QUANTISATION_VARIANCE
-    cells = np.clip(marker.at * CELLS, 0, CELLS - 1).astype(np.int64)
-    number = cells[1] * CELLS + cells[0]
-    in_cells = partial(np.bincount, number, minlength=CELLS**2)
-    # A cell's point is where its edges are, most of them at a side of the marker.
-    edge = (state.slope**2).sum(axis=0) + 1e-12
-    rows, columns = np.nonzero(marker.used)
-    points = np.array([in_cells(edge * each) for each in (columns, rows)])
-    right, down = (
-        np.array([in_cells(one * slope) for one in influence.T]) for slope in state.slope
+    covariance = variance * products(influence)
+    by_pixel = influence.T * state.slope[:, None]
+    if edges.variance.value > 0:
+        # Pixel by pixel: points of a module, or means over its area, would be too coarse.
+        images = np.zeros((2, CORNERS, *marker.used.shape))
+        images[..., marker.used] = by_pixel
+        along_y, along_x = (
+            np.exp(-0.5 * np.subtract.outer(each, each) ** 2 / edges.length_px.value**2)
+            for each in map(np.arange, marker.used.shape)
+        )
+        covariance += edges.size_px.value**2 * np.einsum(
+            "kayx,kbyx->ab", images, along_y @ images @ along_x)
+    # Lagrange's polynomials at Chebyshev's nodes, by those of Chebyshev.
+    reach, unit = np.abs(marker.at - 0.5).max(), np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
+    polynomials = np.linalg.inv(chebvander(unit, NODES - 1))
+    columns, rows = (
+        chebvander((each - 0.5) / reach, NODES - 1) @ polynomials for each in marker.at
     )
-    return (
-        influence.T @ (influence * variance[:, None]),
-        (points / np.maximum(in_cells(edge), 1e-12)).T + marker.frame_px, right, down,
-    )
+    at_nodes = (columns[:, :, None] * rows[:, None, :]).reshape(-1, NODES**2)
+    nodes = np.stack(np.meshgrid(unit, unit, indexing="ij"), axis=-1).reshape(-1, 2)
+    return covariance, marker.shown.pixels(0.5 + reach * nodes), *(by_pixel @ at_nodes)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -648,8 +646,7 @@ def _terms(
         )]
 
     judge = partial(judged, refused)
-    black = of_photographs(lambda state: state.levels[0])
-    white = of_photographs(lambda state: state.levels.sum())
+    black, white = (estimate(each) for each in np.transpose([fit.levels for fit in fits]))
     ground = of_photographs(lambda state: state.marker.ground, np.median)
     variances = [estimate(each) for each in np.transpose([fit.noise for fit in fits])]
     deviations = [each.mapped(lambda square: math.sqrt(max(square, 0.0))) for each in variances]
@@ -676,7 +673,7 @@ def _terms(
     source = fits[0].states[0].marker.shown.source
     if source in (TruthSource.board_without_this_marker, TruthSource.poses_file):
         scale, unknown = of_photographs(_scale), "too few photographs or markers"
-        geometry = geometry_field(fits, edges, scale.value)
+        geometry = geometry_field(fits, edges)
     # Noise is measured behind the compression, which at edges adds about what it takes from noise
     # in flat areas.
     quality = of_photographs(lambda state: state.marker.shown.jpeg_quality)

@@ -456,16 +456,16 @@ class PhotographFit(NamedTuple):
     ----------
     parameters
         (3,) its parameters. Of those that were moved they are the minimum of the quadratic
-        approximation, so that a variance of 0 may be below 0; shifts of parts of markers are
-        eliminated in it, which would be taken for bloom.
+        approximation, so that a variance of 0 may be below 0.
     states
         Its markers.
-    noise
-        (2,) variance of pixels on black and on white (:func:`photograph_noise`).
+    levels, noise
+        (2,) mean and variance of pixels on black and on white (:func:`flat_pixels`).
     """
 
     parameters: Floats
     states: tuple[MarkerState, ...]
+    levels: Floats
     noise: Floats
 
 
@@ -504,24 +504,21 @@ def fit_photograph(
         ]
     result = shared.copy()
     if moved.any():
-        result[moved] += _shared_step(states, moved, uneven=True)
-    return PhotographFit(result, tuple(states), photograph_noise(states))
+        result[moved] += _shared_step(states, moved)
+    return PhotographFit(result, tuple(states), *flat_pixels(states))
 
 
-def _shared_step(
-    states: Sequence[MarkerState], moved: Masks, *, uneven: bool = False
-) -> Floats:
+def _shared_step(states: Sequence[MarkerState], moved: Masks) -> Floats:
     """Return the step of the photograph's moved parameters, the markers' own ones eliminated.
 
-    ``uneven`` shifts of parts of markers are eliminated, too: those that grow with the square of
-    the position, which corners cannot take up.
+    Uneven shifts of parts of markers are eliminated, too: those that grow with the square of the
+    position, which corners cannot take up, and which would be taken for bloom.
     """
     size = int(moved.sum())
     information, gradient = np.zeros((size, size)), np.zeros(size)
     for state in states:
-        own = state.jacobian[:, :OWN]
-        if uneven:
-            own = np.hstack([own, *((state.slope * at * (1 - at)).T for at in state.marker.at)])
+        uneven = ((state.slope * at * (1 - at)).T for at in state.marker.at)
+        own = np.hstack([state.jacobian[:, :OWN], *uneven])
         count = own.shape[1]
         sums = products(np.column_stack([own, state.jacobian[:, OWN:][:, moved], state.residuals]))
         inner, outer = sums[:count, count:], sums[count:, count:]
@@ -542,8 +539,9 @@ def _good(states: Sequence[MarkerState]) -> list[MarkerState]:
 
 
 # --------------------------------------------------------------------------------------------------
-# Noise of photographs, from the residuals of pixels far from edges.
+# Levels and noise of photographs, from pixels far from edges.
 #
+# Shifts of single edges are far larger than noise: they move the levels that are fitted with them.
 # A fit takes a part of the noise into its parameters: of a pixel the share that its derivatives
 # explain, the diagonal of QQᵀ with their orthonormal columns Q. It is computed and added.
 
@@ -554,12 +552,14 @@ FLAT_PER_PX, FLAT_SHARE = 5e-3, 0.03
 MIN_PIXELS = 100
 
 
-def photograph_noise(states: Sequence[MarkerState]) -> Floats:
-    """Return the variances (2,) of pixels on black and on white, from a photograph's markers.
+def flat_pixels(states: Sequence[MarkerState]) -> tuple[Floats, Floats]:
+    """Return the mean levels (2,) of black and of white, and the variances (2,) of pixels on them.
 
-    In squared grey levels, without the variance of rounding; NaN where too few pixels are flat.
+    In grey levels, and squared ones without the variance of rounding. With too few flat pixels the
+    levels are those of the fit, and the variances NaN.
     """
-    squares, counts, freedom = np.zeros(2), np.zeros(2), np.zeros(2)
+    fitted = np.mean([[state.levels[0], state.levels.sum()] for state in states], axis=0)
+    sums, squares, counts, freedom = np.zeros((4, 2))
     for state in states:
         inverse = np.linalg.pinv(products(state.jacobian), hermitian=True)
         explained = np.einsum("ni,ij,nj->n", state.jacobian, inverse, state.jacobian)
@@ -567,8 +567,11 @@ def photograph_noise(states: Sequence[MarkerState]) -> Floats:
         flat = (steepness < FLAT_PER_PX) & state.jacobian[:, CORNERS].astype(bool)
         for k in range(2):
             area = flat & (np.abs(state.share - k) < FLAT_SHARE)
+            sums[k] += state.residuals[area].sum()
             squares[k] += (state.residuals[area] ** 2).sum()
             counts[k] += area.sum()
             freedom[k] += area.sum() - explained[area].sum()
+    enough = counts >= MIN_PIXELS
     variance = squares / np.maximum(freedom, 1.0) - QUANTISATION_VARIANCE
-    return np.where(counts >= MIN_PIXELS, variance, np.nan)
+    return (fitted + np.where(enough, sums / np.maximum(counts, 1.0), 0.0),
+            np.where(enough, variance, np.nan))

@@ -20,7 +20,6 @@ from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.analysis import error_statistics
 from sweep.errors import ArgumentError, SweepError
 from sweep.evaluation.inspection import scene_image
-from sweep.experiment.photographs import PhotographRecord
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, TruthSource
@@ -33,7 +32,7 @@ from sweep.photographs.cameras import (
     fit_pose,
 )
 from sweep.photographs.folder import FoundCorners
-from sweep.photographs.prepare import prepare, twin_pipeline, unshared_variance
+from sweep.photographs.prepare import prepare, record_of, twin_pipeline, unshared_variance
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +41,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photographs")
     shots = write_set(folder)
     first = cv2.imread(str(shots / "shot0.png"), cv2.IMREAD_GRAYSCALE)
-    pixels = true_corners(0)[3]
+    pixels = imaged(board().corners_m[3], *POSES[0])
     cv2.fillConvexPoly(first, np.rint(pixels).astype(np.int32), 210)
     cv2.imwrite(str(shots / "shot0.png"), first)
     (shots / "notes.txt").write_text("not a photograph")
@@ -53,11 +52,10 @@ def made(tmp_path_factory):
     return folder, results.load()
 
 
-def true_corners(number):
-    """Return the images (M, 4, 2) of the markers' corners in a photograph."""
-    turn, shift = POSES[number]
-    points = board().corners_m @ turn.T + shift
-    return points[..., :2] / points[..., 2:] * VIEW[:2] + VIEW[2:]
+def imaged(points, turn, shift):
+    """Return the images (..., 2) of points (..., 3) of the board at a pose."""
+    seen = points @ turn.T + shift
+    return seen[..., :2] / seen[..., 2:] * VIEW[:2] + VIEW[2:]
 
 
 def test_the_truth_is_that_of_the_board_within_its_standard_deviation(made):
@@ -79,8 +77,8 @@ def test_the_truth_is_that_of_the_board_within_its_standard_deviation(made):
 
 def test_the_markers_wholly_in_the_frame_count_whether_found_or_not(made):
     _, results = made
-    for number in range(len(POSES)):
-        pixels = true_corners(number)
+    for number, pose in enumerate(POSES):
+        pixels = imaged(board().corners_m, *pose)
         inside = ((pixels >= -0.5) & (pixels <= np.array(SIZE) - 0.5)).all(axis=(1, 2))
         flags = results.detection[number, :, 0].values
         counted = flags != DetectionStatus.not_in_photograph
@@ -136,8 +134,7 @@ def test_a_photograph_is_the_draw_of_every_interval(made):
         mean = each[used].mean()
         # The ratio estimator: sums of deviations by photograph (Cochran, 1977, section 3.12).
         sums = np.where(used, each - mean, 0.0).sum(axis=1)
-        m = len(sums)
-        half = 2.7764451 * np.sqrt(m / (m - 1) * (sums**2).sum()) / used.sum()
+        half = 2.7764451 * np.sqrt(5 / 4 * (sums**2).sum()) / used.sum()  # of five photographs
         assert np.isclose(table.range_bias_percent[j], mean)
         assert np.isclose(table.range_bias_percent_high[j] - mean, half, rtol=1e-6)
 
@@ -152,8 +149,7 @@ def test_the_photographs_are_verified_by_their_digests(made):
     content = name.read_bytes()
     cv2.imwrite(str(name), np.full(SIZE[::-1], 128, np.uint8))
     try:
-        changed = verify(store, sample=2)
-        assert "shot2.png" in changed.not_sampled
+        assert "shot2.png" in verify(store, sample=2).not_sampled
     finally:
         name.write_bytes(content)
 
@@ -176,7 +172,7 @@ def prepared(tmp_path_factory):
 
 
 def test_rows_are_those_of_the_photographs_with_their_poses(prepared):
-    record, _ = PhotographRecord.read(f"{prepared.folder}/{prepared.name}.photographs.npz")
+    record = record_of(prepared)
     twins = twin_pipeline(prepared, SCENE, repeats=2)
     columns = run_cells(twins, whole(twins).indices()).columns
     shown = record.shown
@@ -213,7 +209,7 @@ def test_what_is_drawn_of_a_photograph_is_the_same_for_all_its_markers(prepared)
 def test_a_twin_has_the_prints_of_its_board_around_the_marker(prepared, marker_id):
     scene = {"black": 35, "white": 210, "background": 120, "blur_px": 0.6}
     twin = cell(twin_pipeline(prepared, scene), f"trial=0,marker_id={marker_id}")
-    record, _ = PhotographRecord.read(f"{prepared.folder}/{prepared.name}.photographs.npz")
+    record = record_of(prepared)
     turn = record.rotation[0, marker_id]
     corners = board().corners_m[marker_id]
     # The whole board at a pose that has the marker where the twin has it.
@@ -225,10 +221,8 @@ def test_a_twin_has_the_prints_of_its_board_around_the_marker(prepared, marker_i
     )
     whole = levels_of(scenes, background=120.0, black=35.0, white=210.0)
     around = 1.8 * (corners - corners.mean(axis=0)) + corners.mean(axis=0)  # 2.4 modules wider
-    x, y, z = (around @ turn.T + shift).T
-    pixels = np.stack([VIEW[0] * x / z + VIEW[2], VIEW[1] * y / z + VIEW[3]], axis=1)
     inside = np.zeros(whole.shape, np.uint8)
-    cv2.fillConvexPoly(inside, np.rint(pixels).astype(np.int32), 1)
+    cv2.fillConvexPoly(inside, np.rint(imaged(around, turn, shift)).astype(np.int32), 1)
     difference = np.abs(scene_image(twin, whole_frame=True) - whole)[inside > 0]
     assert difference.max() < 1.0  # rounding
 
@@ -261,13 +255,12 @@ def test_the_covariance_of_a_calibration_has_opencvs_standard_deviations():
     made, _ = calibrate(SIZE, turned)
     covariance = covariance_of(made)
     assert np.sqrt(np.diag(covariance)) == pytest.approx(made.sd, rel=1e-3)
-    correlation = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
-    assert correlation > 0.5  # both focal lengths rest on the same depths
+    # Both focal lengths rest on the same depths.
+    assert covariance[0, 1] > 0.5 * np.sqrt(covariance[0, 0] * covariance[1, 1])
 
 
 def test_a_camera_that_does_not_fit_its_photographs_is_refused():
-    rng = np.random.default_rng(1)
-    turned = [seen(number, rng, 4.0) for number in range(len(POSES))]
+    turned = [seen(number, np.random.default_rng(number), 4.0) for number in range(len(POSES))]
     with pytest.raises(ArgumentError, match="px RMS beside the camera; expected at most"):
         calibrate(SIZE, turned)
 
@@ -280,7 +273,6 @@ def test_what_truth_and_estimates_do_not_share_is_that_of_fitted_poses(number):
     factor[1, 0] = 0.35
     covariance = factor @ factor.T
     turn, shift = POSES[number]
-    turn = np.asarray(turn)
     own = board().corners_m[4]
     centre = own.mean(axis=0)
     own, others = own - centre, board().chessboard_m - centre
@@ -306,7 +298,5 @@ def test_a_files_covariance_is_that_of_its_numbers(tmp_path):
     path = tmp_path / "camera.json"
     matrix = np.diag(np.arange(1.0, 10.0)).ravel().tolist()
     path.write_text(camera()[:-1] + f', "covariance_intrinsics": {matrix}}}')
-    known = camera_of_file(str(path), SIZE)
-    covariance = covariance_of(known)
-    assert covariance.shape == (4 + len(known.distortion),) * 2
+    covariance = covariance_of(camera_of_file(str(path), SIZE))
     assert np.diag(covariance).tolist() == list(range(1, 10))

@@ -15,7 +15,7 @@ from sweep.measure.likelihood import BLACK, DEPTH, OUTSIDE, OUTSIDE_SHARE, SPREA
 from sweep.measure.surroundings import BoardMarker, ring_modules, surroundings
 from sweep.model import polygon
 from sweep.model.board import Board
-from sweep.model.coverage import NODES, POSE, WEIGHTS, MarkerEdges
+from sweep.model.coverage import POSE, MarkerEdges
 from sweep.model.lens import jacobian, undistort
 from sweep.model.marker import module_count
 from sweep.model.polygon import ModuleEdge, Optics, Projection
@@ -36,12 +36,19 @@ from sweep.typing import Floats, Grey, Integers
 #: Standard deviations at which the point spread is cut off; 5e-4 of it lies beyond.
 REACH = 3.5
 
-#: Length of one panel of the quadrature in standard deviations of the point spread: 4e-4 of the
-#: jump.
-PANEL = 2.0
+#: Most Gauss-Legendre nodes of one panel of an edge, and most panels.
+MOST_NODES, MAX_PANELS = 24, 4096
 
-#: Most panels of one straight segment.
-MAX_PANELS = 4096
+#: (n, 2, k) nodes on [-1, 1] of the quadrature with n nodes, and their weights.
+_GAUSS = np.zeros((MOST_NODES + 1, 2, MOST_NODES))
+for _n in range(1, MOST_NODES + 1):
+    _GAUSS[_n, :, :_n] = np.polynomial.legendre.leggauss(_n)
+
+#: Nodes of a panel, and of each standard deviation of the point spread along it: 3e-4 of the jump.
+END_NODES, NODES_A_DEVIATION = 2.0, 0.85
+
+#: Places in a pixel, for each standard deviation, between which an edge's share is interpolated.
+PHASES = 32.0
 
 _STEPS = 64
 _AT = np.arange(-6 * _STEPS, 6 * _STEPS + 2) / _STEPS
@@ -53,21 +60,14 @@ _BELOW_SUM = _AT * _BELOW + _DENSITY
 
 
 @compiled_inline
-def _normal(at: float, distance: float, sigma: float) -> tuple[float, float, float]:
-    """Return the normal distribution's integral, the integral of that in px, and its density.
-
-    ``at`` is a place in the tables, that of the px ``distance`` from the middle; beyond their ends
-    the integral is 0 or 1.
-    """
-    if at >= 12.0 * _STEPS:
-        return 1.0, distance, 0.0
-    if at <= 0.0:
-        return 0.0, 0.0, 0.0
+def _normal(distance: float, sigma: float) -> tuple[float, float, float]:
+    """Return the normal distribution's integral, the integral of that in px, and its density."""
+    at = min(max((distance / sigma + 6.0) * _STEPS, 0.0), 12.0 * _STEPS)
     k = int(at)
     part = at - k
     return (
         _BELOW[k] + part * (_BELOW[k + 1] - _BELOW[k]),
-        sigma * (_BELOW_SUM[k] + part * (_BELOW_SUM[k + 1] - _BELOW_SUM[k])),
+        max(sigma * (_BELOW_SUM[k] + part * (_BELOW_SUM[k + 1] - _BELOW_SUM[k])), distance),
         _DENSITY[k] + part * (_DENSITY[k + 1] - _DENSITY[k]),
     )
 
@@ -102,79 +102,94 @@ def system(height: int, width: int) -> System:
 
 
 @compiled
-def _add_segment(
-    out: System, jump: float, outside: float, sigma: float, shortest: float,
-    xa: float, ya: float, xb: float, yb: float,
+def _taps(sigma: float) -> Floats:
+    """Return what an edge's point does to the pixels around it, by its place in a pixel.
+
+    (places, 4 · taps): of each pixel from the first in reach on the step of the share of what is
+    beyond the point, its slope twice, and the slope's slope over twice the standard deviation.
+    """
+    reach = REACH * sigma + 0.5
+    most, places = int(2.0 * reach) + 3, math.ceil(PHASES / sigma)
+    taps = np.empty((places + 1, 4 * most))
+    for place in range(places + 1):
+        row, at = taps[place], -reach - place / places
+        low, low_sum, low_density = _normal(at, sigma)
+        before = 0.0
+        for m in range(most):
+            at += 1.0
+            high, high_sum, high_density = _normal(at, sigma)
+            share = 1.0 if m == most - 1 else high_sum - low_sum
+            row[4 * m] = share - before
+            row[4 * m + 1] = row[4 * m + 2] = high - low
+            row[4 * m + 3] = 0.5 * (high_density - low_density) / sigma
+            before, low, low_sum, low_density = share, high, high_sum, high_density
+    return taps
+
+
+@compiled
+def _add_edge(
+    out: System, taps: Floats, jump: float, outside: float, sigma: float, shortest: float,
+    ends: tuple[float, float, float, float, float, float],
 ) -> None:
-    """Add a straight segment from (xa, ya) to (xb, yb) px of the box.
+    """Add a smooth curve, ``ends`` its first, middle and last point: x and y in px of the box.
 
     ``jump`` is the image's step across it, ``outside`` that of the area outside.
     """
     rates, outsides = out.rates, out.outside
     height, width = outsides.shape[0], outsides.shape[1] - 1
-    reach = REACH * sigma + 0.5
+    xa, ya, xm, ym, xb, yb = ends
+    reach, most, places = REACH * sigma + 0.5, taps.shape[1] // 4, len(taps) - 1
     if min(xa, xb) > width + reach or min(ya, yb) > height + reach or max(ya, yb) < -reach:
         return
-    panels = min(
-        max(math.ceil(math.hypot(xb - xa, yb - ya) / max(PANEL * sigma, shortest)), 1), MAX_PANELS
-    )
-    dx, dy = (xb - xa) / panels, (yb - ya) / panels
-    most = int(2.0 * reach) + 3
-    basis, along_y, steps = np.empty(4 * most), np.zeros(4 * most), np.empty(most)
-    scale = _STEPS / sigma
-    for panel in range(panels):
-        for node in range(3):
-            t = panel + NODES[node]
-            x, y = xa + t * dx, ya + t * dy
-            first, last = math.floor(x - reach), math.floor(x + reach) + 1
-            top, bottom = max(math.floor(y - reach), 0), min(math.floor(y + reach), height - 1)
-            if first >= width or top > bottom:
-                continue
-            weight_x, weight_y = WEIGHTS[node] * jump * dy, WEIGHTS[node] * jump * dx
-            curved_x, curved_y = 0.5 * weight_x / sigma, 0.5 * weight_y / sigma
-            begin, end = max(first, 0), min(last, width - 1)
-            # Columns left of the box are one step at its first column.
-            passed = before = low = low_sum = low_density = 0.0
-            at = (first - x) * scale + 6.0 * _STEPS
-            if at > 0.0:
-                k = int(at)
-                low, low_sum, low_density = _BELOW[k], sigma * _BELOW_SUM[k], _DENSITY[k]
-            for j in range(first, end + 1):
-                at = (j + 1.0 - x) * scale + 6.0 * _STEPS
-                high, high_sum, high_density = _normal(at, j + 1.0 - x, sigma)
-                share = 1.0 if j == last else high_sum - low_sum
-                if j < 0:
-                    passed += share - before
-                else:
-                    m = j - begin
-                    near = high - low
-                    steps[m] = share - before
-                    basis[4 * m] = weight_x * (share - before)
-                    basis[4 * m + 1] = weight_x * near
-                    basis[4 * m + 2] = -weight_y * near
-                    basis[4 * m + 3] = curved_x * (high_density - low_density)
-                    along_y[4 * m + 3] = curved_y * near
-                before, low, low_sum, low_density = share, high, high_sum, high_density
-            at = (top - y) * scale + 6.0 * _STEPS
-            low, low_density = 0.0, 0.0
-            if at > 0.0:
-                k = int(at)
-                low, low_density = _BELOW[k], _DENSITY[k]
-            count, start = max(end - begin + 1, 0), 4 * begin
-            for i in range(top, bottom + 1):
-                high, _, high_density = _normal((i + 1.0 - y) * scale + 6.0 * _STEPS, 0.0, sigma)
-                share, change = high - low, low_density - high_density
-                low, low_density = high, high_density
-                row = rates[i]
-                for m in range(4 * count):
-                    row[start + m] += share * basis[m] + change * along_y[m]
-                if passed != 0.0:
-                    rates[i, 0] += share * weight_x * passed
-                if outside != 0.0:
-                    factor = share * outside * WEIGHTS[node] * dy
-                    outsides[i, 0] += factor * passed
-                    for m in range(count):
-                        outsides[i, begin + m] += factor * steps[m]
+    needed = NODES_A_DEVIATION * math.hypot(xb - xa, yb - ya) / max(sigma, shortest)
+    panels = min(max(math.ceil(needed / (MOST_NODES - END_NODES)), 1), MAX_PANELS)
+    count = min(math.ceil(needed / panels + END_NODES), MOST_NODES)
+    # The curve through the three points: x = xa + t (slope_x + t bend_x).
+    bend_x, bend_y = 2.0 * (xa + xb - 2.0 * xm), 2.0 * (ya + yb - 2.0 * ym)
+    slope_x, slope_y = xb - xa - bend_x, yb - ya - bend_y
+    basis, along_y = np.empty(4 * most), np.zeros(4 * most)
+    for k in range(panels * count):
+        panel, node = k // count, k % count
+        t = (panel + 0.5 + 0.5 * _GAUSS[count, 0, node]) / panels
+        weight = 0.5 * _GAUSS[count, 1, node] / panels
+        left = xa + t * (slope_x + t * bend_x) - reach
+        upper = ya + t * (slope_y + t * bend_y) - reach
+        first, top = math.floor(left), math.floor(upper)
+        begin, end = max(first, 0), min(first + most, width)
+        start, stop = max(top, 0), min(top + most, height)
+        if first >= width or start >= stop:
+            continue
+        weight_x = weight * (slope_y + 2.0 * t * bend_y)
+        weight_y = -weight * (slope_x + 2.0 * t * bend_x)
+        place = int((left - first) * places)
+        part, low, high = (left - first) * places - place, taps[place], taps[place + 1]
+        # Columns left of the box are one step at its first column.
+        passed = 0.0
+        for m in range(min(begin - first, most)):
+            passed += low[4 * m] + part * (high[4 * m] - low[4 * m])
+        passed *= weight_x
+        count_x = 4 * max(end - begin, 0)
+        for m in range(0, count_x, 4):
+            tap = m + 4 * (begin - first)
+            near = low[tap + 1] + part * (high[tap + 1] - low[tap + 1])
+            basis[m] = weight_x * (low[tap] + part * (high[tap] - low[tap]))
+            basis[m + 1] = weight_x * near
+            basis[m + 2] = along_y[m + 3] = weight_y * near
+            basis[m + 3] = weight_x * (low[tap + 3] + part * (high[tap + 3] - low[tap + 3]))
+        place = int((upper - top) * places)
+        part, low, high = (upper - top) * places - place, taps[place], taps[place + 1]
+        for i in range(start, stop):
+            tap = 4 * (i - top)
+            share = low[tap + 1] + part * (high[tap + 1] - low[tap + 1])
+            change = low[tap + 3] + part * (high[tap + 3] - low[tap + 3])
+            row, of_jump, by_y = rates[i], jump * share, jump * change
+            for m in range(count_x):
+                row[4 * begin + m] += of_jump * basis[m] + by_y * along_y[m]
+            row[0] += of_jump * passed
+            if outside != 0.0:
+                outsides[i, 0] += outside * share * passed
+                for m in range(0, count_x, 4):
+                    outsides[i, begin + m // 4] += outside * share * basis[m]
 
 
 @compiled
@@ -197,9 +212,9 @@ def add_plane(
     sigma
         The point spread's standard deviation in px, positive.
     shortest
-        Least length of a panel of the quadrature in px.
+        Least standard deviation in px for which edges are integrated.
     """
-    ends, sides, flat = edges.ends, edges.sides, polygon.flat_sheet()
+    ends, sides, flat, taps = edges.ends, edges.sides, polygon.flat_sheet(), _taps(sigma)
     for e in range(ends.shape[0]):
         jump = values[sides[e, 1]] - values[sides[e, 0]]
         outside = 1.0 * (sides[e, 1] == 0) - 1.0 * (sides[e, 0] == 0)
@@ -207,16 +222,11 @@ def add_plane(
             continue
         edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
         x, y = polygon.edge_pixel(0.0, edge, projection, flat)
+        middle_x, middle_y = polygon.edge_pixel(0.5, edge, projection, flat)
         u, v = polygon.edge_pixel(1.0, edge, projection, flat)
-        chords = 1
-        if projection.optics.distorted:
-            chords = polygon.chord_count(edge, 0, 1, (x, y, u, v), projection, flat)
-        for chord in range(1, chords + 1):
-            u, v = polygon.edge_pixel(chord / chords, edge, projection, flat)
-            _add_segment(
-                out, jump, outside, sigma, shortest, x + 0.5, y + 0.5, u + 0.5, v + 0.5
-            )
-            x, y = u, v
+        _add_edge(out, taps, jump, outside, sigma, shortest, (
+            x + 0.5, y + 0.5, middle_x + 0.5, middle_y + 0.5, u + 0.5, v + 0.5,
+        ))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -511,9 +521,9 @@ likelihood.MODELS[PhotographView] = _squares_of_photograph
 #: Pixels around the fitted ones in the box.
 PADDING_PX = 2
 
-#: Least length of the pieces in which edges are integrated, in px: of the photograph, and of means
-#: of 2 x 2 pixels, whose fit is a start.
-PANEL_PX, COARSE_PANEL_PX = 0.4, 0.8
+#: Least point spread for which edges are integrated, in px: of the photograph, and of means of
+#: 2 x 2 pixels, whose fit is a start.
+PANEL_PX, COARSE_PANEL_PX = 0.2, 0.25
 
 #: Pixels around the fitted ones within which print is in the model: what blur carries inwards.
 MODELLED_PX = 5.0
@@ -585,6 +595,8 @@ def photograph_view(
     at, spans = _fitted_pixels(
         to_modules, float(modules), ring, height, width, np.array([left, top, right, bottom])
     )
+    if (spans[:, 1] - spans[:, 0]).sum() <= SIZE:
+        return None  # fewer pixels than parameters
     return PhotographView(
         known, levels, spans, rays_of(optics, height, width), at, PANEL_PX, toned
     )
@@ -687,8 +699,8 @@ MAX_CORRELATION = 0.9
 #: Components of nodes that move a pixel's level: two of each of the four nodes around it.
 HELD = 8
 
-#: Numbers kept of each pixel: the pose's six changes by its level, and its residual.
-WIDE, RESIDUAL = 2 * TILE, POSE
+#: Numbers kept of each pixel: the pose's six changes by its level.
+WIDE = 2 * TILE
 
 
 @compiled
@@ -776,18 +788,18 @@ def _correlated_products(
     """
     height, width, _ = field.shape
     above, pairs = np.zeros((width, WIDE)), np.zeros((width, WIDE))
-    passed, sums = np.empty((width, POSE)), np.zeros((WIDE, WIDE))
+    passed, sums = np.empty((width, WIDE)), np.zeros((WIDE, WIDE))
     for i in range(height):
-        row, carried = field[i], np.zeros(POSE)
+        row, carried = field[i], np.zeros(WIDE)
         for j in range(width):
             at, before = row[j], passed[j]
-            for m in range(POSE):
+            for m in range(WIDE):
                 before[m] = carried[m]
                 carried[m] = across * (carried[m] + at[m])
-        carried = np.zeros(POSE)
+        carried = np.zeros(WIDE)
         for j in range(width - 1, -1, -1):
             at, before, sum_above, pair = row[j], passed[j], above[j], pairs[j]
-            for m in range(POSE):
+            for m in range(WIDE):
                 total = carried[m] + at[m]
                 carried[m] = across * total
                 weighted = along * sum_above[m]
@@ -801,15 +813,15 @@ def _correlated_products(
 
 
 @compiled
-def _lagged(field: Floats, view: PhotographView, down: int, right: int) -> float:
-    """Return the mean product of residuals of fitted pixels a lag apart."""
+def _lagged(residuals: Floats, view: PhotographView, down: int, right: int) -> float:
+    """Return the mean product of residuals (height, width) of fitted pixels a lag apart."""
     total, count = 0.0, 0
-    for i in range(len(field) - down):
+    for i in range(len(residuals) - down):
         first = max(view.spans[i, 0], view.spans[i + down, 0] - right)
         last = min(view.spans[i, 1], view.spans[i + down, 1] - right)
-        row, other = field[i], field[i + down]
+        row, other = residuals[i], residuals[i + down]
         for j in range(first, last):
-            total += row[j, RESIDUAL] * other[j + right, RESIDUAL]
+            total += row[j] * other[j + right]
         count += max(last - first, 0)
     return total / max(count, 1)
 
@@ -862,11 +874,11 @@ def judge(
         return math.nan
     # The rest after the best field of shifts is noise.
     fitted -= likelihood.product(influence, shifts)
-    field = np.zeros((height, width, WIDE))
-    _write_residuals(view, state, work.images, inverse, fitted, shifts, field)
-    variance = _lagged(field, view, 0, 0)
-    across = _ratio(_lagged(field, view, 0, 1), variance)
-    along = _ratio(_lagged(field, view, 1, 0), variance)
+    field, residuals = np.zeros((height, width, WIDE)), np.empty((height, width))
+    _write_residuals(view, state, work.images, inverse, fitted, shifts, field, residuals)
+    variance = _lagged(residuals, view, 0, 0)
+    across = _ratio(_lagged(residuals, view, 0, 1), variance)
+    along = _ratio(_lagged(residuals, view, 1, 0), variance)
     variance *= pixels / freedom
     products = _correlated_products(field, view, across, along)
     for m in range(POSE):
@@ -895,30 +907,27 @@ def judge(
 @compiled
 def _write_residuals(
     view: PhotographView, state: Floats, images: Floats, inverse: Floats,
-    fitted: Floats, shifts: Floats, field: Floats,
+    fitted: Floats, shifts: Floats, field: Floats, residuals: Floats,
 ) -> None:
-    """Write the pose's changes by the pixels' levels, and residuals, to ``field``, which is 0."""
-    columns, weights = np.empty((GROUP, SIZE + 1 + HELD)), np.zeros((SIZE + 1, WIDE))
-    of_cell = np.empty(HELD)
-    weights[SIZE, RESIDUAL] = 1.0
-    for k in range(SIZE):
-        weights[k, RESIDUAL] = -fitted[k, 0]
-        for m in range(POSE):
-            weights[k, m] = inverse[k, m]
+    """Write the pose's changes by the pixels' levels to ``field``, which is 0, and residuals."""
+    columns, of_cell = np.empty((GROUP, SIZE + 1 + HELD)), np.empty(HELD)
     for i in range(len(view.spans)):
         first, last = view.spans[i]
         while first < last:
             cell, stop = _write_cell(view, state, images, i, first, columns)
-            for a in range(HELD):
-                of_cell[a] = shifts[_column(cell, SIZE + 1 + a) - SIZE - 1, 0]
+            for k in range(HELD):
+                of_cell[k] = shifts[_column(cell, SIZE + 1 + k) - SIZE - 1, 0]
             for j in range(stop - first):
                 column, out = columns[j], field[i, first + j]
-                for k in range(SIZE + 1):
-                    value, weight = column[k], weights[k]
-                    for m in range(WIDE):
+                residual = column[SIZE]
+                for k in range(SIZE):
+                    value, weight = column[k], inverse[k]
+                    residual -= value * fitted[k, 0]
+                    for m in range(POSE):
                         out[m] += value * weight[m]
-                for a in range(HELD):
-                    out[RESIDUAL] -= column[SIZE + 1 + a] * of_cell[a]
+                for k in range(HELD):
+                    residual -= column[SIZE + 1 + k] * of_cell[k]
+                residuals[i, first + j] = residual
             first = stop
 
 
@@ -926,8 +935,8 @@ def _write_residuals(
 # The pose in a photograph: the best minimum of several starts, and its covariance.
 
 #: Of photographs. The last step is taken: near the minimum the one after it is a hundredth as long.
-#: At an excess of 50 coarse fits ruled a mirror out that was right, one of 521; at 100 none.
-REAL = likelihood.Search(4.0, 16.0, 100.0)
+#: At an excess of 100 coarse fits ruled a mirror out that was right, one of 521; at 150 none.
+REAL = likelihood.Search(4.0, 16.0, 150.0)
 
 #: Turn between two minima, in radians, below which it does not matter which is right.
 SAME_POSE_RAD = math.radians(5.0)
@@ -976,6 +985,17 @@ def locate_photograph(
 CORRELATED_SHARE = 0.3
 
 
+@compiled
+def _levels_at(view: PhotographView, state: Floats) -> Floats:
+    """Return the levels (height, width) of the model at a state, the linear parameters fitted."""
+    fitted, work = state.copy(), system(*view.levels.shape)
+    likelihood.squared_residuals(view, fitted, work, np.empty((MOVED, MOVED)), np.empty(MOVED))
+    contrast, images = fitted[WHITE] - fitted[BLACK], work.images
+    change = fitted[OUTSIDE] - fitted[BLACK] - contrast * state[OUTSIDE_SHARE]
+    share = images[0] + fitted[TONE] * images[1]
+    return np.asarray(fitted[BLACK] + contrast * share + change * images[5])
+
+
 def log_odds(view: PhotographView, state: Floats, other: Floats) -> float:
     """Return the logarithm of the odds of a fitted state (18,) against another one.
 
@@ -983,21 +1003,11 @@ def log_odds(view: PhotographView, state: Floats, other: Floats) -> float:
     """
     if not likelihood.turn_between(state, other) > SAME_POSE_RAD:
         return math.inf
-    work = system(*view.levels.shape)
-    information, gradient = np.empty((MOVED, MOVED)), np.empty(MOVED)
-    images = []
-    for fitted in (state.copy(), other.copy()):
-        likelihood.squared_residuals(view, fitted, work, information, gradient)
-        draw(view, fitted, work)
-        share = work.images[0] + fitted[TONE] * work.images[1]
-        images.append(fitted[BLACK] + (fitted[WHITE] - fitted[BLACK]) * share)
-    columns = np.arange(view.levels.shape[1])
+    fitted, columns = _levels_at(view, state), np.arange(view.levels.shape[1])
     used = (view.spans[:, :1] <= columns) & (columns < view.spans[:, 1:])
-    residual = (view.levels - images[0]) * used
-    change = (images[0] - images[1]) * used
+    residual, change = (view.levels - fitted) * used, (fitted - _levels_at(view, other)) * used
     side = math.ceil(CORRELATED_SHARE * math.sqrt(used.sum()))
-    sums = np.pad(residual * change, side).cumsum(axis=0).cumsum(axis=1)
-    sums = sums[side:] - sums[:-side]
-    sums = sums[:, side:] - sums[:, :-side]
+    products = np.pad(residual * change, side)
+    sums = cv2.boxFilter(products, -1, (side, side), normalize=False)
     spread = (sums**2).sum() / side**2 / (change**2).sum()
     return float((change * (2.0 * residual + change)).sum() / (2.0 * spread))

@@ -12,7 +12,7 @@ from sweep.measure import likelihood, solver
 from sweep.measure.estimation import Detections, Estimates, covariance_elsewhere, pose_covariance
 from sweep.measure.flags import Ambiguous, EstimateStatus
 from sweep.measure.likelihood import BLACK, DEPTH, POSITION, WHITE
-from sweep.measure.photograph import SIZE, locate_photograph, log_odds, photograph_view, pixel_count
+from sweep.measure.photograph import locate_photograph, log_odds, photograph_view
 from sweep.model.board import box_corners, extent_of, own_sheets, sheets_m, unit_m
 from sweep.model.coverage import POSE
 from sweep.model.marker import module_count
@@ -292,7 +292,7 @@ class PhotometricReal(Photometric):
             detections.corners[row], detections.cameras.optics(row), detections.images[row],
             detections.origins[row], self.tone,
         ) if len(starts) and target.is_marker else None
-        if view is None or pixel_count(view) <= SIZE:
+        if view is None:
             return None
         covariance = np.empty((POSE, POSE))
         state, level, reached, other, freedom, misfit = locate_photograph(view, starts, covariance)

@@ -110,8 +110,8 @@ def test_first_use_is_announced_and_no_later_one(monkeypatch, capsys):
     bound = Pipeline.from_text(
         "[pose]\nside_px = 50\n[scene]\nnoise_grey = 2\nbound = 'known_blur'")
     for pipeline, compiled, seconds in (
-        (plain, "", 8), (bound, "", 18), (bound, "sweep.model.coverage.accumulate", 10),
-        (plain, "", 0), (bound, "sweep.measure.likelihood.descend", 0),
+        (plain, "", 3), (bound, "", 27), (bound, "sweep.model.coverage.draw_greys", 24),
+        (plain, "", 0), (bound, "sweep.measure.likelihood.descend", 4),
     ):
         cached.add(compiled)
         announce_compilation(pipeline)

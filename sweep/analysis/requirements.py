@@ -618,7 +618,7 @@ def _needed(
         # Student's factor of so few draws is far above that of many.
         probability = (1.0 + level) / 2.0
         reach *= special.ndtri(probability) / special.stdtrit(draws - 1.0, probability)
-    return _rounded(max(least, draws * reach ** 2))
+    return rounded_draws(max(least, draws * reach ** 2))
 
 
 def _of_rate(rate: float, limit: float, level: float) -> float:
@@ -627,10 +627,10 @@ def _of_rate(rate: float, limit: float, level: float) -> float:
     hits = np.floor(rate * POWERS) if rate > limit else np.ceil(rate * POWERS)
     low, high = estimator.clopper_pearson(hits, POWERS, level)
     decided = POWERS[low > limit if rate > limit else high < limit]
-    return _rounded(decided[0]) if decided.size else math.inf
+    return rounded_draws(decided[0]) if decided.size else math.inf
 
 
-def _rounded(count: float) -> float:
+def rounded_draws(count: float) -> float:
     """Return a number of draws with two digits, rounded up; infinite if it is too large."""
     if count > estimator.MAX_DRAWS:
         return math.inf

@@ -237,9 +237,7 @@ def needs(each: Cause) -> str:
     """Return the draws of an undecided requirement, and how many would decide it."""
     if each.decision is not Decision.undecided or math.isnan(each.draws_needed):
         return ""
-    if math.isinf(each.draws_needed):
-        return f"{each.draws:,} draws, no number would decide so small a difference"
-    return f"{each.draws:,} draws, about {each.draws_needed:,.0f} would decide"
+    return tables.draws_text(each.draws, each.draws_needed)
 
 
 def more_draws(found: Sequence[Verdict], results: xr.Dataset, store: str) -> str:

@@ -12,22 +12,37 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy import special
 
 from sweep.analysis import error_statistics
 from sweep.analysis.comparisons import paired_tables
 from sweep.analysis.dataset import QUANTITIES, SIZE_AXES, is_grid_axis, of_photographs, sections_of
 from sweep.analysis.estimator import LEVEL
-from sweep.analysis.requirements import ANGLE_AXES, SIZES_BESIDE, conditions, parse_requirements
+from sweep.analysis.requirements import (
+    ANGLE_AXES,
+    SIZES_BESIDE,
+    conditions,
+    parse_requirements,
+    rounded_draws,
+)
 from sweep.errors import StoreError, SweepError, texts_of
 from sweep.execution.status import Totals, account_of
 from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
 from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.report.table import Column, Table, Value, axis_label, column, number
+from sweep.report.table import Column, Table, Value, axis_label, column, draws_text, number
 from sweep.store.lifecycle import open_dataset, open_finished
 from sweep.tradeoff.pareto import WRONG, conditions_of, configuration_label
-from sweep.tradeoff.verdicts import BETTER, VERDICTS, WORSE, first_verdict, verdict
+from sweep.tradeoff.verdicts import (
+    BETTER,
+    EQUIVALENT_WITHIN,
+    NOT_DECIDED,
+    VERDICTS,
+    WORSE,
+    first_verdict,
+    verdict,
+)
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -432,13 +447,40 @@ class Difference(NamedTuple):
     ----------
     column, numbers
         The quantity, and its value with its 95 % interval, NaN without one.
-    verdict
-        One of `VERDICTS`: how the best one is.
+    deciding
+        The same with the interval that decides.
+    draws
+        Draws that both have.
     """
 
     column: Column
     numbers: Value
-    verdict: str
+    deciding: Value
+    draws: int
+
+    @property
+    def verdict(self) -> str:
+        """One of `VERDICTS`: how the best one is."""
+        return verdict(self.deciding.low, self.deciding.high, self.column.level or 0.0)
+
+    @property
+    def draws_needed(self) -> tuple[float, float]:
+        """About how many draws would tell the two apart, and show that they are equivalent.
+
+        Intervals (of ratios that of the logarithm) narrow with the root of the number of draws.
+        The difference may be a standard error nearer to the bound than it seems, so that most runs
+        with so many draws decide (`pytest -m evidence tests/report/test_false_better.py`).
+        """
+        equal = self.column.level or 0.0
+        with np.errstate(all="ignore"):
+            ends = np.array([*self.deciding, *EQUIVALENT_WITHIN[equal]])
+            value, low, high, least, most = (np.log(ends) if equal else ends).tolist()
+        half = (high - low) / 2.0
+        nearer = half / special.ndtri((1.0 + DECIDING_LEVEL) / 2.0)
+        apart, within = (
+            self.draws * (half / room) ** 2 if (room := gap - nearer) > 0.0 else math.inf
+            for gap in (abs(value), min(value - least, most - value)))
+        return apart, within
 
     def as_json(self) -> dict[str, Any]:
         """Return it as JSON values."""
@@ -496,7 +538,8 @@ class Comparison:
             next((each for each in (*pair[2:], *pair) if each.verdict == self.verdicts[rival]
                   and not np.isnan(each.numbers.value)), pair[0])]
         circle = "None is best: " * self.circle
-        line = f"{circle}{self.name} against {names[rival]}: {'; '.join(map(str, shown))}"
+        words = "; ".join(filter(None, (*map(str, shown), more_draws(pair))))
+        line = f"{circle}{self.name} against {names[rival]}: {words}"
         told = [self.verdicts[k] for k in others]
         words = ", ".join(f"{word} {told.count(word)}" for word in VERDICTS if word in told)
         return line if len(others) == 1 else f"{line} (of {len(others)} others: {words})"
@@ -526,6 +569,8 @@ class Comparison:
     def as_json(self) -> list[dict[str, Any]]:
         """Return the differences of the best configuration from each, as JSON values."""
         return [{"configuration": self.name, "against": name, "verdict": self.verdicts[k],
+                 "draws": self.differences[k][0].draws,
+                 "draws_needed": draws_to_decide(self.differences[k]),
                  "differences": [each.as_json() for each in self.differences[k]]}
                 for k, name in enumerate(self.known.names) if k != self.best]
 
@@ -534,11 +579,28 @@ def verdict_words(differences: Sequence[Difference]) -> str:
     """Return by what the other one is better or worse: ``worse: detection; better: range``."""
     first, other = overall(differences), {BETTER: WORSE, WORSE: BETTER}
     if first not in other:
-        return first
+        return ": ".join(filter(None, (first, more_draws(differences))))
     parts = [f"{other[verdict]}: {', '.join(names)}" for verdict in (first, other[first]) if (
         names := [each.column.heading.split()[0] for each in differences
                   if each.verdict == verdict])]
     return "; ".join(parts)
+
+
+def draws_to_decide(differences: Sequence[Difference]) -> float:
+    """Return about how many draws would decide on all quantities together; NaN if it is decided.
+
+    They would show one of the quantities to be better or worse, or all to be equivalent.
+    """
+    if not differences or overall(differences) != NOT_DECIDED:
+        return math.nan
+    apart, within = zip(*(each.draws_needed for each in differences), strict=True)
+    return rounded_draws(min(*apart, max(within)))
+
+
+def more_draws(differences: Sequence[Difference]) -> str:
+    """Return the draws of a comparison that is not decided, and how many would decide it."""
+    needed = draws_to_decide(differences)
+    return "" if math.isnan(needed) else draws_text(differences[0].draws, needed)
 
 
 def overall(differences: Sequence[Difference]) -> str:
@@ -595,7 +657,7 @@ def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, .
     out = []
     for each in (*PAIRED[:2], UNFLIPPED if few else PAIRED[2], PAIRED[3]):
         (numbers,), (ends,) = each.cells(shown), each.cells(deciding)
-        out.append(Difference(each, numbers, verdict(ends.low, ends.high, each.level or 0.0)))
+        out.append(Difference(each, numbers, ends, int(shown["draws"])))
     return tuple(out)
 
 

@@ -112,6 +112,17 @@ def axis_label(results: xr.Dataset, name: str) -> str:
     return f"{words.replace('_', ' ')}, {unit}" if unit else words.replace("_", " ")
 
 
+def draws_text(draws: int, needed: float) -> str:
+    """Return the draws of what is not decided, and about how many would decide it.
+
+    >>> draws_text(60, 4300.0)
+    '60 draws, about 4,300 would decide'
+    """
+    if math.isinf(needed):
+        return f"{draws:,} draws, no number would decide so small a difference"
+    return f"{draws:,} draws, about {needed:,.0f} would decide"
+
+
 # --------------------------------------------------------------------------------------------------
 # The cells of tables that are more than a word or a number.
 

@@ -181,7 +181,6 @@ def test_poses_that_cannot_be_seen_are_no_condition():
 @pytest.mark.parametrize(("texts", "problem"), [
     (["detection"], "expected NAME >= NUMBER"),
     (["detection >= 99 %"], "write 0.99"),
-    (["detection >= 95"], "write 0.95 for 95 %"),
     (["detection >= 1"], "expected a limit above 0 and below 1"),
     (["detektion >= 0.9"], "did you mean detection_rate?"),
     (["rotation_p95_rad <= 1"], "its unit is degrees: write rotation_p95_deg"),

@@ -106,7 +106,6 @@ def test_the_limits_of_a_store_are_printed_and_drawn():
     (["two.zarr", "detection"], "REQUIREMENT detection: expected NAME >= NUMBER"),
     (["two.zarr", "nees <= 7"], "nees_mean: no pose of this store has such a number"),
     (["drawn.zarr", "detection >= 0.5", "--per", "distance_m"], "is drawn in this store"),
-    (["two.zarr", "--per", "trial"], "intervals are over the draws"),
     (["two.zarr", "--at", "side=40"], "--at side=40: unknown parameter; did you mean side_px?"),
     (["once.zarr"], "has no section [require]"),
     (["two.zarr", "--against", "once.zarr"], "not the same scenes"),

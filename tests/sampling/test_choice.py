@@ -58,14 +58,6 @@ def test_an_answer_that_a_better_one_may_replace_is_not_decided(wish, rates, bou
     assert list(shown["known"]) == ["size_m"]
 
 
-@pytest.mark.parametrize("largest", [1.0, np.nan], ids=["kept", "not in the image"])
-def test_a_decided_answer_is_told_as_one(largest, chosen):
-    choice = chosen([[0.0, 0.0], [1.0, 1.0], [largest, largest]], 200)
-    assert choice.decision is Decision.met
-    assert size_lines.headline(choice).startswith("size_m=0.04 is the smallest choice")
-    assert size_lines.as_json(choice)["answer"] == {"size_m": 0.04}
-
-
 def test_trials_are_needed_up_to_the_first_size_that_fails():
     """Of sizes 0.02, 0.08, 0.04 the walk is 0.08, 0.04, 0.02; 4X4 fails at 0.04 and tilt 60.
 

@@ -20,7 +20,6 @@ def faults_of(**change):
 @pytest.mark.parametrize(("change", "line"), [
     ({"search": {"smallest": "dictionary", "among": []}}, "expected an axis of several numbers"),
     ({"search": {"smallest": "size"}}, "size: no such axis; did you mean size_m?"),
-    ({"search": {"largest": "size_m"}}, "precision, not smallest and largest"),
     ({"search": {"max_trials": 30}}, "search.max_trials = 30: expected at least "),
     ({"axes": {"size_m": [0.02]}}, "an axis of several numbers, from easy to hard"),
     ({"search": {"smallest": "distance_m"}, "pose": {"distance_m": {"uniform": [1, 2]}}},

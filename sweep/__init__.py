@@ -38,13 +38,11 @@ if TYPE_CHECKING:
     from sweep.cli.reference import reference
     from sweep.diagnosis.detection import error_model
     from sweep.diagnosis.diagnosis import diagnose
-    from sweep.execution.runner import limit
     from sweep.experiment.pipeline import Pipeline
     from sweep.fitting.fit import fit
-    from sweep.report.findings import measure_tradeoff, require
+    from sweep.report.findings import limit, measure_tradeoff, require, size
     from sweep.report.table import Findings
     from sweep.report.write_report import write_report
-    from sweep.tradeoff.choice_search import size
 
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
@@ -59,9 +57,9 @@ experiment.quantity_faults = lambda texts, names: (  # noqa: PLW0108  (imported 
 #: Modules of the library by the public names that are imported from them.
 _IMPORTED_ON_USE = {
     "Pipeline": "pipeline", "decode_flags": "dataset",
-    "diagnose": "diagnosis", "error_model": "detection", "fit": "fit", "limit": "runner",
+    "diagnose": "diagnosis", "error_model": "detection", "fit": "fit", "limit": "findings",
     "measure_tradeoff": "findings", "reference": "reference", "require": "findings",
-    "size": "choice_search", "write_report": "write_report",
+    "size": "findings", "write_report": "write_report",
 }
 
 

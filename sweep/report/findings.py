@@ -11,7 +11,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import partial, wraps
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,8 +25,8 @@ from sweep.analysis.error_models import CONDITIONS, PREDICTORS, QUANTITIES, Use,
 from sweep.analysis.estimator import INTERVAL
 from sweep.analysis.requirements import CONFIDENCE, Cause, Decision, Reach, Verdict, described
 from sweep.errors import ArgumentError, check_positive, path_of, texts_of
+from sweep.execution import runner
 from sweep.execution.progress import progress_display, stage_display
-from sweep.execution.runner import execute
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.pipeline import parse_selection
 from sweep.messages import label, nearest, notice, quoted
@@ -37,6 +37,8 @@ from sweep.report.output_file import check_output_file, figure_file, write_outpu
 from sweep.report.report_data import ReportData, read_report_data, trade_lines
 from sweep.report.table import Column, Findings, Table, Value, coordinate, number, table_of
 from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
+from sweep.tradeoff import choice_search
+from sweep.tradeoff.choice_search import Choice
 from sweep.tradeoff.measurement import measure_trade
 from sweep.tradeoff.pareto import CRITERIA, mark_front
 from sweep.tradeoff.pareto import UNITS as ERRORS
@@ -46,7 +48,6 @@ from sweep.version import __version__
 if TYPE_CHECKING:
     from sweep.analysis.requirements import Answer
     from sweep.experiment.pipeline import Pipeline
-    from sweep.tradeoff.choice_search import Choice
 
 WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "not decided",
          Decision.not_applicable: "nothing to judge"}
@@ -332,6 +333,22 @@ def choice_findings(choice: Choice) -> Findings:
         (f"sweep report {quoted(choice.store)}", ""))
 
 
+class PrintedChoice(choice_search.Choice):
+    """A choice that prints itself as ``sweep size`` does."""
+
+    def __str__(self) -> str:
+        return str(choice_findings(self))
+
+    def _repr_html_(self) -> str:
+        return choice_findings(self)._repr_html_()
+
+
+@wraps(choice_search.size)
+def size(*given: Any, **options: Any) -> PrintedChoice:
+    """Return the choice of `sweep.tradeoff.choice_search.size`, which prints itself."""
+    return PrintedChoice(**vars(choice_search.size(*given, **options)))
+
+
 def as_json(choice: Choice) -> dict[str, Any]:
     """Return the content of ``--json``.
 
@@ -439,6 +456,27 @@ def limit_findings(limits: xr.Dataset) -> Findings:
     return Findings(
         [limit_table(limits), line], limits_as_json(limits) | {"store": store}, limits,
         tables.UNDECIDED if undecided else 0, (f"sweep report {quoted(store)}", ""))
+
+
+class PrintedLimits(xr.Dataset):  # type: ignore[no-untyped-call]
+    """Limits that print themselves as ``sweep limit`` does; parts of them as datasets do."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        whole = {*judged.LIMITS} <= {*self.variables}
+        return str(limit_findings(self)) if whole else super().__str__()
+
+    def _repr_html_(self) -> str:
+        whole = {*judged.LIMITS} <= {*self.variables}
+        return limit_findings(self)._repr_html_() if whole else super()._repr_html_()
+
+
+@wraps(runner.limit)
+def limit(*given: Any, **options: Any) -> PrintedLimits:
+    """Return the limits of `sweep.execution.runner.limit`, which print themselves."""
+    found = runner.limit(*given, **options)
+    return PrintedLimits(found.data_vars, found.coords, found.attrs)
 
 
 def limits_as_json(limits: xr.Dataset) -> dict[str, Any]:
@@ -881,7 +919,7 @@ def measure_tradeoff(
     if store.lower().endswith(".toml"):
         pipeline = read_pipeline(store)
         with progress_display() if progress else contextlib.nullcontext() as display:
-            summary = execute(pipeline, None, progress=display)
+            summary = runner.execute(pipeline, None, progress=display)
         notice(*summary.warnings)
         store = str(summary.store)
     question = {"criterion": criterion} | ({} if budget_ms is None else {"budget_ms": budget_ms})

@@ -14,17 +14,11 @@ import numpy as np
 import xarray as xr
 from scipy import special
 
-from sweep.analysis import error_statistics
+from sweep.analysis import error_statistics, requirements
 from sweep.analysis.comparisons import paired_tables
 from sweep.analysis.dataset import QUANTITIES, SIZE_AXES, is_grid_axis, of_photographs, sections_of
 from sweep.analysis.estimator import LEVEL
-from sweep.analysis.requirements import (
-    ANGLE_AXES,
-    SIZES_BESIDE,
-    conditions,
-    parse_requirements,
-    rounded_draws,
-)
+from sweep.analysis.requirements import ANGLE_AXES, SIZES_BESIDE, conditions, parse_requirements
 from sweep.errors import StoreError, SweepError, texts_of
 from sweep.execution.status import Totals, account_of
 from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
@@ -33,16 +27,9 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.report.table import Column, Table, Value, axis_label, column, draws_text, number
 from sweep.store.lifecycle import open_dataset, open_finished
+from sweep.tradeoff import verdicts
 from sweep.tradeoff.pareto import WRONG, conditions_of, configuration_label
-from sweep.tradeoff.verdicts import (
-    BETTER,
-    EQUIVALENT_WITHIN,
-    NOT_DECIDED,
-    VERDICTS,
-    WORSE,
-    first_verdict,
-    verdict,
-)
+from sweep.tradeoff.verdicts import BETTER, VERDICTS, WORSE, first_verdict, verdict
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -464,7 +451,7 @@ class Difference(NamedTuple):
         return verdict(self.deciding.low, self.deciding.high, self.column.level or 0.0)
 
     @property
-    def draws_needed(self) -> tuple[float, float]:
+    def draws_needed(self) -> list[float]:
         """About how many draws would tell the two apart, and show that they are equivalent.
 
         Intervals (of ratios that of the logarithm) narrow with the root of the number of draws.
@@ -473,14 +460,12 @@ class Difference(NamedTuple):
         """
         equal = self.column.level or 0.0
         with np.errstate(all="ignore"):
-            ends = np.array([*self.deciding, *EQUIVALENT_WITHIN[equal]])
+            ends = np.array([*self.deciding, *verdicts.EQUIVALENT_WITHIN[equal]])
             value, low, high, least, most = (np.log(ends) if equal else ends).tolist()
         half = (high - low) / 2.0
         nearer = half / special.ndtri((1.0 + DECIDING_LEVEL) / 2.0)
-        apart, within = (
-            self.draws * (half / room) ** 2 if (room := gap - nearer) > 0.0 else math.inf
-            for gap in (abs(value), min(value - least, most - value)))
-        return apart, within
+        return [self.draws * (half / room) ** 2 if (room := gap - nearer) > 0.0 else math.inf
+                for gap in (abs(value), min(value - least, most - value))]
 
     def as_json(self) -> dict[str, Any]:
         """Return it as JSON values."""
@@ -591,10 +576,10 @@ def draws_to_decide(differences: Sequence[Difference]) -> float:
 
     They would show one of the quantities to be better or worse, or all to be equivalent.
     """
-    if not differences or overall(differences) != NOT_DECIDED:
+    if not differences or overall(differences) != verdicts.NOT_DECIDED:
         return math.nan
     apart, within = zip(*(each.draws_needed for each in differences), strict=True)
-    return rounded_draws(min(*apart, max(within)))
+    return requirements.rounded_draws(min(*apart, max(within)))
 
 
 def more_draws(differences: Sequence[Difference]) -> str:

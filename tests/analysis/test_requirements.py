@@ -185,7 +185,6 @@ def test_poses_that_cannot_be_seen_are_no_condition():
     (["detektion >= 0.9"], "did you mean detection_rate?"),
     (["rotation_p95_rad <= 1"], "its unit is degrees: write rotation_p95_deg"),
     (["rotation_error <= 5"], "which statistic of it? There are rotation_median_deg, "),
-    (["range_p95_percent <= -1"], "expected a limit above 0"),
     (["yaw_bias_deg >= -1"], "the absolute value is required"),
     (["rotation_p95_deg >= 200"], "above 0 and below 180"),
     (["detection >= 0.99", "detection <= 0.5"], "contradicts detection_rate <= 0.5"),

@@ -21,7 +21,6 @@ def faults_of(**change):
     ({"search": {"smallest": "dictionary", "among": []}}, "expected an axis of several numbers"),
     ({"search": {"smallest": "size"}}, "size: no such axis; did you mean size_m?"),
     ({"search": {"max_trials": 30}}, "search.max_trials = 30: expected at least "),
-    ({"axes": {"size_m": [0.02]}}, "an axis of several numbers, from easy to hard"),
     ({"search": {"smallest": "distance_m"}, "pose": {"distance_m": {"uniform": [1, 2]}}},
      "distance_m: no such axis; expected one under [axes] of the scene: "),
     ({"require": None}, 'expected what must be met: [require] all = ["detection >= 0.99"]'),

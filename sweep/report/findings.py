@@ -38,7 +38,6 @@ from sweep.report.report_data import ReportData, read_report_data, trade_lines
 from sweep.report.table import Column, Findings, Table, Value, coordinate, number, table_of
 from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
 from sweep.tradeoff import choice_search
-from sweep.tradeoff.choice_search import Choice
 from sweep.tradeoff.measurement import measure_trade
 from sweep.tradeoff.pareto import CRITERIA, mark_front
 from sweep.tradeoff.pareto import UNITS as ERRORS
@@ -258,7 +257,7 @@ def more_draws(found: Sequence[Verdict], results: xr.Dataset, store: str) -> str
 # --------------------------------------------------------------------------------------------------
 # Output of ``sweep size``: the answer in a line, a table of the alternatives, JSON.
 
-def headline(choice: Choice) -> str:
+def headline(choice: choice_search.Choice) -> str:
     """Return the decision on a choice in a line: the choice, or what comes nearest to one."""
     rule, best = choice.rule, choice.best
     if best is not None:
@@ -280,7 +279,7 @@ def headline(choice: Choice) -> str:
     return f"{line}; nearest is {described(chosen)}: {reason(one.cause)}"
 
 
-def _chosen(choice: Choice, answer: Answer) -> dict[str, Any]:
+def _chosen(choice: choice_search.Choice, answer: Answer) -> dict[str, Any]:
     """Return the values by axis of an alternative, the axis that is searched first."""
     searched = {} if answer.value is None else {choice.rule.along: answer.value}
     return searched | dict(answer.alternative)
@@ -296,7 +295,7 @@ def reason(cause: Cause | None) -> str:
             f"{valued(cause.value, cause.low, cause.high, cause.units)}{at}{draws}")
 
 
-def alternatives(choice: Choice) -> Table:
+def alternatives(choice: choice_search.Choice) -> Table:
     """Return a row for each alternative: those that meet all first, the best of them before."""
     along, budget = choice.rule.along, choice.budget_ms
     rows = []
@@ -319,7 +318,7 @@ def alternatives(choice: Choice) -> Table:
          "kept beyond, by estimate"], rows, stub=len(choice.rule.among), words=True)
 
 
-def choice_findings(choice: Choice) -> Findings:
+def choice_findings(choice: choice_search.Choice) -> Findings:
     """Return a choice as findings, which print themselves.
 
     Exit status: 0 there is one, 1 none meets everything, 3 not decided.
@@ -349,7 +348,7 @@ def size(*given: Any, **options: Any) -> PrintedChoice:
     return PrintedChoice(**vars(choice_search.size(*given, **options)))
 
 
-def as_json(choice: Choice) -> dict[str, Any]:
+def as_json(choice: choice_search.Choice) -> dict[str, Any]:
     """Return the content of ``--json``.
 
     ``answer`` is the decided choice; ``known`` meets the requirements, though a better choice may,

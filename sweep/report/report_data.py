@@ -522,9 +522,8 @@ class Comparison:
         shown = [each for each in pair if each.verdict in (BETTER, WORSE)] or [
             next((each for each in (*pair[2:], *pair) if each.verdict == self.verdicts[rival]
                   and not np.isnan(each.numbers.value)), pair[0])]
-        circle = "None is best: " * self.circle
         words = "; ".join(filter(None, (*map(str, shown), more_draws(pair))))
-        line = f"{circle}{self.name} against {names[rival]}: {words}"
+        line = f"{'None is best: ' * self.circle}{self.name} against {names[rival]}: {words}"
         told = [self.verdicts[k] for k in others]
         words = ", ".join(f"{word} {told.count(word)}" for word in VERDICTS if word in told)
         return line if len(others) == 1 else f"{line} (of {len(others)} others: {words})"
@@ -554,7 +553,6 @@ class Comparison:
     def as_json(self) -> list[dict[str, Any]]:
         """Return the differences of the best configuration from each, as JSON values."""
         return [{"configuration": self.name, "against": name, "verdict": self.verdicts[k],
-                 "draws": self.differences[k][0].draws,
                  "draws_needed": draws_to_decide(self.differences[k]),
                  "differences": [each.as_json() for each in self.differences[k]]}
                 for k, name in enumerate(self.known.names) if k != self.best]

@@ -570,11 +570,13 @@ def verdict_words(differences: Sequence[Difference]) -> str:
 
 
 def draws_to_decide(differences: Sequence[Difference]) -> float:
-    """Return about how many draws would decide on all quantities together; NaN if it is decided.
+    """Return about how many draws would decide on all quantities together.
 
-    They would show one of the quantities to be better or worse, or all to be equivalent.
+    NaN if it is decided, and without intervals. They would show one of the quantities to be better
+    or worse, or all to be equivalent.
     """
-    if not differences or overall(differences) != verdicts.NOT_DECIDED:
+    without = np.isnan([each.deciding.low for each in differences]).all()  # a single draw, or none
+    if without or overall(differences) != verdicts.NOT_DECIDED:
         return math.nan
     apart, within = zip(*(each.draws_needed for each in differences), strict=True)
     return requirements.rounded_draws(min(*apart, max(within)))
@@ -637,11 +639,10 @@ def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, .
     shown, deciding = paired_tables(
         first, second, (), None, QUANTITIES[:2], (LEVEL, DECIDING_LEVEL))
     few = 0 < int(shown["only_first_flipped"] + shown["only_second_flipped"]) < MIN_FLIPPED
-    out = []
-    for each in (*PAIRED[:2], UNFLIPPED if few else PAIRED[2], PAIRED[3]):
-        (numbers,), (ends,) = each.cells(shown), each.cells(deciding)
-        out.append(Difference(each, numbers, ends, int(shown["draws"])))
-    return tuple(out)
+    return tuple(
+        Difference(each, numbers, ends, int(shown["draws"]))
+        for each in (*PAIRED[:2], UNFLIPPED if few else PAIRED[2], PAIRED[3])
+        for numbers, ends in zip(each.cells(shown), each.cells(deciding), strict=True))
 
 
 # --------------------------------------------------------------------------------------------------

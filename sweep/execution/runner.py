@@ -39,18 +39,17 @@ if TYPE_CHECKING:
 
 def announce_compilation(pipeline: Pipeline) -> None:
     """Say in a line on stderr that a pipeline's functions are compiled, if they have not been."""
-    solvers, bounds = pipeline.values_of("solver"), {*pipeline.values_of("bound")} - {"none"}
+    used = {*pipeline.values_of("solver"), *(p.name for p in pipeline.facts.parts if p.active)}
     changing = {"lens distortion", *(effect.label for effect in pipeline.experiment.effects)}
     # Function -> how many seconds it takes with those that it needs, and whether it is used.
     needed = {
         "model.coverage.draw_greys": (3, True),
-        "model.exposure.outline_extent": (
-            4, any(part.active and part.name in changing for part in pipeline.facts.parts)),
-        "measure.likelihood.descend": (20, "photometric" in solvers or bounds),
-        "measure.photograph.locate_photograph": (30, "photometric_real" in solvers),
+        "model.exposure.outline_extent": (4, used & changing),
+        "measure.likelihood.descend": (20, used & {"photometric", "accuracy bound"}),
+        "measure.photograph.locate_photograph": (30, "photometric_real" in used),
     }
-    seconds = sum(length for name, (length, used) in needed.items()
-                  if used and not compilation.is_cached(*f"sweep.{name}".rsplit(".", 1)))
+    seconds = sum(length for name, (length, runs) in needed.items()
+                  if runs and not compilation.is_cached(*f"sweep.{name}".rsplit(".", 1)))
     if seconds:
         notice(f"compiling, once for this version: about {seconds} s")
 

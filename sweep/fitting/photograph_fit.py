@@ -14,7 +14,7 @@ from sweep.errors import ArgumentError
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import TruthSource
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
-from sweep.measure.photograph import PANEL_PX, add_plane, photograph_view, system
+from sweep.measure.photograph import add_plane, photograph_view, system
 from sweep.measure.surroundings import BoardMarker, clear_modules, ring_modules
 from sweep.model.board import Board, single_marker
 from sweep.model.calibration import VIEW, Calibration
@@ -272,7 +272,7 @@ def drawn(ends: Floats, sides: Integers, size: tuple[int, int], sigma_px: float)
     height, width = size
     space = system(height, width)
     edges = MarkerEdges(np.ascontiguousarray(ends.reshape(-1, 4)), sides)
-    add_plane(space, edges, WHITE_SHARE, IN_PIXELS, sigma_px, PANEL_PX)
+    add_plane(space, edges, WHITE_SHARE, IN_PIXELS, sigma_px)
     rates = np.moveaxis(space.rates.reshape(height, width + 1, 4)[:, :width], 2, 0)
     white = np.cumsum(rates[0], axis=1)
     outside = np.cumsum(space.outside[:, :width], axis=1)

@@ -128,7 +128,7 @@ def _taps(sigma: float) -> Floats:
 
 @compiled
 def _add_edge(
-    out: System, taps: Floats, jump: float, outside: float, sigma: float, shortest: float,
+    out: System, taps: Floats, jump: float, outside: float, sigma: float,
     ends: tuple[float, float, float, float, float, float],
 ) -> None:
     """Add a smooth curve, ``ends`` its first, middle and last point: x and y in px of the box.
@@ -141,7 +141,7 @@ def _add_edge(
     reach, most, places = REACH * sigma + 0.5, taps.shape[1] // 4, len(taps) - 1
     if min(xa, xb) > width + reach or min(ya, yb) > height + reach or max(ya, yb) < -reach:
         return
-    needed = NODES_A_DEVIATION * math.hypot(xb - xa, yb - ya) / max(sigma, shortest)
+    needed = NODES_A_DEVIATION * math.hypot(xb - xa, yb - ya) / max(sigma, MIN_SPREAD_PX)
     panels = min(max(math.ceil(needed / (MOST_NODES - END_NODES)), 1), MAX_PANELS)
     count = min(math.ceil(needed / panels + END_NODES), MOST_NODES)
     # The curve through the three points: x = xa + t (slope_x + t bend_x).
@@ -194,8 +194,7 @@ def _add_edge(
 
 @compiled
 def add_plane(
-    out: System, edges: MarkerEdges, values: Floats, projection: Projection, sigma: float,
-    shortest: float,
+    out: System, edges: MarkerEdges, values: Floats, projection: Projection, sigma: float
 ) -> None:
     """Add the edges of a printed plane to ``out``.
 
@@ -211,8 +210,6 @@ def add_plane(
         The plane, and the camera.
     sigma
         The point spread's standard deviation in px, positive.
-    shortest
-        Least standard deviation in px for which edges are integrated.
     """
     ends, sides, flat, taps = edges.ends, edges.sides, polygon.flat_sheet(), _taps(sigma)
     for e in range(ends.shape[0]):
@@ -222,11 +219,15 @@ def add_plane(
             continue
         edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
         x, y = polygon.edge_pixel(0.0, edge, projection, flat)
-        middle_x, middle_y = polygon.edge_pixel(0.5, edge, projection, flat)
         u, v = polygon.edge_pixel(1.0, edge, projection, flat)
-        _add_edge(out, taps, jump, outside, sigma, shortest, (
-            x + 0.5, y + 0.5, middle_x + 0.5, middle_y + 0.5, u + 0.5, v + 0.5,
-        ))
+        # The curve through three points is within 0.005 px of what a lens makes of such pieces.
+        pieces = 1 + polygon.chord_count(edge, 0, 1, (x, y, u, v), projection, flat) // 32
+        for piece in range(pieces):
+            xm, ym = polygon.edge_pixel((piece + 0.5) / pieces, edge, projection, flat)
+            u, v = polygon.edge_pixel((piece + 1.0) / pieces, edge, projection, flat)
+            _add_edge(out, taps, jump, outside, sigma, (
+                x + 0.5, y + 0.5, xm + 0.5, ym + 0.5, u + 0.5, v + 0.5))
+            x, y = u, v
 
 
 # --------------------------------------------------------------------------------------------------
@@ -280,8 +281,6 @@ class PhotographView(NamedTuple):
         its u and v by them, row by row, in px.
     at
         (2, height, width) x and y relative to the marker's centre, in halves of its extent.
-    panel_px
-        Least length of the pieces in which edges are integrated.
     toned
         Whether the tone curve is estimated.
     """
@@ -291,7 +290,6 @@ class PhotographView(NamedTuple):
     spans: Integers
     rays: Floats
     at: Floats
-    panel_px: float
     toned: bool
 
 
@@ -338,7 +336,6 @@ def draw(view: PhotographView, state: Floats, work: System) -> None:
     add_plane(
         work, view.marker.edges, np.array([state[OUTSIDE_SHARE], 0.0, 1.0]),
         Projection(likelihood.plane_of(state, view.marker), view.marker.optics), state[SPREAD],
-        view.panel_px,
     )
     tone = min(max(state[TONE], -MAX_TONE), MAX_TONE)
     for i in range(height):
@@ -521,10 +518,6 @@ likelihood.MODELS[PhotographView] = _squares_of_photograph
 #: Pixels around the fitted ones in the box.
 PADDING_PX = 2
 
-#: Least point spread for which edges are integrated, in px: of the photograph, and of means of
-#: 2 x 2 pixels, whose fit is a start.
-PANEL_PX, COARSE_PANEL_PX = 0.2, 0.25
-
 #: Pixels around the fitted ones within which print is in the model: what blur carries inwards.
 MODELLED_PX = 5.0
 
@@ -598,7 +591,7 @@ def photograph_view(
     if (spans[:, 1] - spans[:, 0]).sum() <= SIZE:
         return None  # fewer pixels than parameters
     return PhotographView(
-        known, levels, spans, rays_of(optics, height, width), at, PANEL_PX, toned
+        known, levels, spans, rays_of(optics, height, width), at, toned
     )
 
 
@@ -648,7 +641,7 @@ def binned_photograph(view: PhotographView) -> PhotographView:
         spans[i, 0] = (first + 1) // 2
         spans[i, 1] = max(last // 2, spans[i, 0])
     marker = likelihood.binned_view(view.marker)
-    return PhotographView(marker, levels, spans, rays, at, COARSE_PANEL_PX, view.toned)
+    return PhotographView(marker, levels, spans, rays, at, view.toned)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -16,14 +16,24 @@ from support.solving import of_markers
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import Ambiguous, EstimateStatus
 from sweep.measure.likelihood import state_of
-from sweep.measure.photograph import HELD, SIZE, _write_cell, draw, photograph_view, system
+from sweep.measure.photograph import (
+    HELD,
+    SIZE,
+    _write_cell,
+    add_plane,
+    draw,
+    photograph_view,
+    system,
+)
 from sweep.measure.photometric import PhotometricReal
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings, with_neighbours
 from sweep.model.board import single_marker
 from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.camera import Cameras
+from sweep.model.coverage import MarkerEdges
 from sweep.model.lens import pack
 from sweep.model.marker import WHITE, module_count
+from sweep.model.polygon import Optics, Projection
 from sweep.model.pose import rotation_of_angles
 
 ALARM = 1e-7
@@ -35,7 +45,7 @@ GRID = Grid(
     corner_squares=True,
 ).board()
 VIEW = np.array([600.0, 610.0, 159.5, 119.5])
-LENS = (-0.2, 0.05, 0.001, -0.001)
+LENS, WIDE_LENS = (-0.2, 0.05, 0.001, -0.001), (-0.25, 0.05, 0.0, 0.0)
 TONED = PhotometricReal(refined=False, spread_free=True, tone=True)
 
 
@@ -154,6 +164,20 @@ def test_the_ring_around_a_marker_that_is_clear():
     assert clear_modules(BoardMarker(CHARUCO, 5)) == pytest.approx(1.0, abs=1e-6)
     assert clear_modules(BoardMarker(plain.board(), 4)) == pytest.approx(2.0, abs=1e-6)
     assert clear_modules(BoardMarker(GRID, 4)) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_an_edge_is_drawn_as_its_pieces_are_however_long_a_lens_bends_it():
+    optics, images = Optics(np.array([400.0, 400.0, 160.0, 60.0]), pack(WIDE_LENS), True), []
+    plane = np.array([[0.1, 0.0, -0.35], [0.0, 0.1, -0.05], [0.0, 0.0, 1.0]])
+    for count in (1, 16):
+        ends = np.full((count, 4), 0.5)
+        ends[:, 1], ends[:, 3] = np.linspace([0.0, 6.0 / count], [6.0 - 6.0 / count, 6.0], count).T
+        out = system(300, 320)
+        add_plane(out, MarkerEdges(ends, np.tile([1, 2], (count, 1))), np.arange(-1.0, 2.0),
+                  Projection(plane, optics), 0.8)
+        images.append(out.rates[:, :-4:4].cumsum(axis=1))
+    assert np.abs(images[1]).max() == pytest.approx(1.0, abs=1e-2)
+    assert np.abs(images[0] - images[1]).max() < 4e-3
 
 
 @pytest.mark.parametrize("lens", first_of([LENS, ()], 1), ids=len)

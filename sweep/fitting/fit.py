@@ -163,7 +163,8 @@ def _misfit(sums: Floats, shares: Floats, variances: Floats) -> Floats:
     cross = np.einsum("ni,njl->lij", a, x)
     scatter = a.T @ a - v * (cross + cross.swapaxes(1, 2)) + v**2 * np.einsum("nil,njl->lij", x, x)
     excess = (sums.mean(axis=0) - v[..., 0] * shares.mean(axis=0).T)[..., None]
-    solved = np.linalg.solve(scatter / (count * (count - 1)), excess)
+    # Photographs that do not differ, such as copies of one, limit nothing: no inverse, but 0.
+    solved = np.linalg.pinv(scatter / (count * (count - 1)), hermitian=True) @ excess
     return np.asarray((excess * solved).sum(axis=(2, 3)))
 
 

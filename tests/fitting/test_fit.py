@@ -12,7 +12,7 @@ from support.board_photographs import BOARD, SIZE, board, camera, toml
 from support.board_scenes import BoardPose, board_scene
 from support.reports import command
 from sweep.analysis.comparisons import GAP_STATISTICS
-from sweep.fitting.fit import REPEATS, Estimate, Field, _corners, needed
+from sweep.fitting.fit import REPEATS, Estimate, Field, _corners, field_of, needed
 from sweep.fitting.photograph_fit import CORNERS, OWN, quality_of
 from sweep.model.exposure import marker_boxes
 from sweep.model.pose import rotation_of_angles
@@ -106,6 +106,11 @@ def test_corners_follow_shifts_of_edges_and_of_smooth_fields_as_their_pixels_do(
     near, far = (of_field(each, np.argwhere(state.marker.used), moved) for each in (4.0, 12.0))
     assert np.allclose(covariance, 0.01 * near, rtol=1e-6)
     assert np.allclose(of_field(12.0, nodes, at_nodes), far, atol=0.02 * far.max())
+
+
+def test_copies_of_one_photograph_limit_nothing():
+    found = field_of(np.zeros((6, 2)), np.ones((6, 2, 3)), np.arange(1.0, 4.0))
+    assert (found.size_px.low, found.size_px.high) == (0.0, np.inf)
 
 
 def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path):

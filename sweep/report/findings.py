@@ -458,24 +458,27 @@ def limit_findings(limits: xr.Dataset) -> Findings:
 
 
 class PrintedLimits(xr.Dataset):  # type: ignore[no-untyped-call]
-    """Limits that print themselves as ``sweep limit`` does; parts of them as datasets do."""
+    """Limits that print themselves as ``sweep limit`` does; what is derived from them does not.
 
-    __slots__ = ()
+    xarray makes parts, copies and results of this class, too, without what `limit` has set.
+    """
+
+    __slots__ = ("_printed",)
 
     def __str__(self) -> str:
-        whole = {*judged.LIMITS} <= {*self.variables}
-        return str(limit_findings(self)) if whole else super().__str__()
+        return str(getattr(self, "_printed", repr(self)))
 
     def _repr_html_(self) -> str:
-        whole = {*judged.LIMITS} <= {*self.variables}
-        return limit_findings(self)._repr_html_() if whole else super()._repr_html_()
+        return str(getattr(self, "_printed", super())._repr_html_())  # type: ignore[union-attr]
 
 
 @wraps(runner.limit)
 def limit(*given: Any, **options: Any) -> PrintedLimits:
     """Return the limits of `sweep.execution.runner.limit`, which print themselves."""
     found = runner.limit(*given, **options)
-    return PrintedLimits(found.data_vars, found.coords, found.attrs)
+    limits = PrintedLimits(found.data_vars, found.coords, found.attrs)
+    limits._printed = limit_findings(found)  # noqa: SLF001  (its own)
+    return limits
 
 
 def limits_as_json(limits: xr.Dataset) -> dict[str, Any]:

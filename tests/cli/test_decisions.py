@@ -101,6 +101,7 @@ def test_the_limits_of_a_store_are_printed_and_drawn():
     found = sweep.limit("two.zarr", along="side_px")
     assert str(found) in command("limit", "two.zarr", "--along", "side_px")[1]
     assert "<table" in found._repr_html_()
+    assert str(sweep.decode_flags(found)).startswith("<xarray.")
 
 
 @pytest.mark.parametrize(("arguments", "line"), [

@@ -462,7 +462,7 @@ class Difference(NamedTuple):
         with np.errstate(all="ignore"):
             ends = np.array([*self.deciding, *verdicts.EQUIVALENT_WITHIN[equal]])
             value, low, high, least, most = (np.log(ends) if equal else ends).tolist()
-        half = (high - low) / 2.0
+        half = max(value - low, high - value)  # the longer side: more than there are so far
         nearer = half / special.ndtri((1.0 + DECIDING_LEVEL) / 2.0)
         return [self.draws * (half / room) ** 2 if (room := gap - nearer) > 0.0 else math.inf
                 for gap in (abs(value), min(value - least, most - value))]

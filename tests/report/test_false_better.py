@@ -56,6 +56,11 @@ def test_two_equal_configurations_are_seldom_told_apart(law, trials, claim):
     assert told <= binom.ppf(1 - 1e-6, count, 0.05)
 
 
+def test_no_fewer_draws_would_decide_than_there_are():
+    open_one = compared(0, 50)[0]._replace(deciding=(-70.0, -92.6, 1.5), draws=10)
+    assert min(open_one.draws_needed) > 10
+
+
 def test_a_difference_that_four_quantities_may_show_by_chance_is_not_decided():
     """Of 40 pairs of equal ones at most 12 are told apart: chance alone exceeds that in 4e-8."""
     assert sum(told_apart(seed, 50, None) for seed in range(40)) <= 12

@@ -14,17 +14,10 @@ from support.board_scenes import BoardPose, board_scene, levels_of
 from support.lengths import first_of
 from support.solving import of_markers
 from sweep.experiment.pipeline import Pipeline
+from sweep.measure import photograph as real
 from sweep.measure.flags import Ambiguous, EstimateStatus
 from sweep.measure.likelihood import state_of
-from sweep.measure.photograph import (
-    HELD,
-    SIZE,
-    _write_cell,
-    add_plane,
-    draw,
-    photograph_view,
-    system,
-)
+from sweep.measure.photograph import HELD, SIZE, _write_cell, draw, photograph_view, system
 from sweep.measure.photometric import PhotometricReal
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings, with_neighbours
 from sweep.model.board import single_marker
@@ -173,8 +166,8 @@ def test_an_edge_is_drawn_as_its_pieces_are_however_long_a_lens_bends_it():
         ends = np.full((count, 4), 0.5)
         ends[:, 1], ends[:, 3] = np.linspace([0.0, 6.0 / count], [6.0 - 6.0 / count, 6.0], count).T
         out = system(300, 320)
-        add_plane(out, MarkerEdges(ends, np.tile([1, 2], (count, 1))), np.arange(-1.0, 2.0),
-                  Projection(plane, optics), 0.8)
+        real.add_plane(out, MarkerEdges(ends, np.tile([1, 2], (count, 1))),
+                       np.arange(-1.0, 2.0), Projection(plane, optics), 0.8)
         images.append(out.rates[:, :-4:4].cumsum(axis=1))
     assert np.abs(images[1]).max() == pytest.approx(1.0, abs=1e-2)
     assert np.abs(images[0] - images[1]).max() < 4e-3

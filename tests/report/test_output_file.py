@@ -1,7 +1,6 @@
 """Files that commands write: whole, through links, and never in place of a device."""
 
 import stat
-from pathlib import Path
 
 import pytest
 
@@ -60,18 +59,3 @@ def test_what_cannot_be_written_is_told_in_a_line(tmp_path):
     }.items():
         assert told(path).endswith(f": cannot be written: {line}")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "loop"]
-
-
-def test_a_failed_write_leaves_the_file_before(tmp_path, monkeypatch):
-    path = tmp_path / "report.html"
-    path.write_bytes(b"old")
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "replace", full)
-        with pytest.raises(StoreError, match="No space left on device"):
-            write_output_file(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]

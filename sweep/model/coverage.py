@@ -354,7 +354,8 @@ def accumulate(
     projection
         The marker's plane, and the camera.
     sigma
-        Standard deviation in pixels of a Gaussian point spread; 0 or None for none.
+        Standard deviation in pixels of a Gaussian point spread; 0 for none, or None where ``sheet``
+        is None.
     sheet
         How the sheet is bent or shifted; None if it is not, and the camera has no lens model.
 

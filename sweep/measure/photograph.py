@@ -221,7 +221,9 @@ def add_plane(
         x, y = polygon.edge_pixel(0.0, edge, projection, flat)
         u, v = polygon.edge_pixel(1.0, edge, projection, flat)
         # The curve through three points is within 0.005 px of what a lens makes of such pieces.
-        pieces = 1 + polygon.chord_count(edge, 0, 1, (x, y, u, v), projection, flat) // 32
+        pieces = 1
+        if projection.optics.distorted:
+            pieces += polygon.chord_count(edge, 0, 1, (x, y, u, v), projection, flat) // 32
         for piece in range(pieces):
             xm, ym = polygon.edge_pixel((piece + 0.5) / pieces, edge, projection, flat)
             u, v = polygon.edge_pixel((piece + 1.0) / pieces, edge, projection, flat)

@@ -73,7 +73,8 @@ def scenes_at(experiment: Experiment, indices: Sequence[NDArray[np.intp]]) -> Sc
     count = len(indices[0]) if indices else 1
     values = experiment.scene_values(indices)
     scenes = build_scenes(values, count, experiment.scene_plugins)
-    visibility = visibility_flags(scenes)
+    absent = values["absent"].values if "absent" in values else DetectionStatus.not_in_photograph
+    visibility = visibility_flags(scenes, absent)
     boards = values["board"].listed(count) if "board" in values else None
     targets = target_scenes(scenes, visibility, boards, experiment.grid.largest_board)
     return SceneBatch(
@@ -161,10 +162,10 @@ def whole_frames(batch: SceneBatch) -> Masks:
     return whole.broadcast(len(batch.scenes), np.bool_)
 
 
-def visibility_flags(scenes: Scenes) -> NDArray[np.uint8]:
+def visibility_flags(scenes: Scenes, absent: NDArray[np.uint8] | int) -> NDArray[np.uint8]:
     """Return why scenes (N,) are not searched; not_run for those that must be.
 
-    The pose of a marker that a photograph does not show is NaN.
+    The pose of a marker that a photograph does not show is NaN: it gets ``absent``, (N,) or one.
     """
     flags = np.full(len(scenes), DetectionStatus.not_run, dtype=np.uint8)
     behind = hidden(scenes)
@@ -172,8 +173,7 @@ def visibility_flags(scenes: Scenes) -> NDArray[np.uint8]:
     flags[not_modelled(scenes) & ~behind] = DetectionStatus.not_modelled
     open_rows = np.flatnonzero(flags == DetectionStatus.not_run)
     flags[open_rows[outside_frame(scenes, open_rows)]] = DetectionStatus.not_visible
-    flags[np.isnan(scenes.translation).any(axis=1)] = DetectionStatus.not_in_photograph
-    return flags
+    return np.where(np.isnan(scenes.translation).any(axis=1), absent, flags).astype(np.uint8)
 
 
 def search_windows(

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sweep.declaration import Declared, check_table, declared_fields
 from sweep.errors import PluginError
 from sweep.experiment.document import file_text, read_document, refusing
+from sweep.measure.flags import DetectionStatus, TruthSource
 from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbours
 from sweep.messages import plain, refusal, shown
 from sweep.model.board import Board
@@ -94,8 +95,6 @@ def board_of(document: Mapping[str, Any], source: str) -> Board:
 #: End of the name of a record's file.
 SUFFIX = ".photographs.npz"
 
-POSE = 6
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotographRecord(ArrayFile):
@@ -118,7 +117,8 @@ class PhotographRecord(ArrayFile):
         (P, M, 6) standard deviations of the poses: rotation vector in rad, position in m, camera
         frame; NaN where they are not known.
     source
-        (P, M) :class:`~sweep.measure.flags.TruthSource`.
+        (P, M) :class:`~sweep.measure.flags.TruthSource`; without a pose ``none`` says that no
+        marker of the board is seen in the photograph.
     board
         The document of the board's file as JSON; empty if the markers are single ones.
     """
@@ -176,8 +176,8 @@ def recorded_poses(
     """Return the parameters of N scenes that are photographs, by name.
 
     They are the image, the pose (NaN where a photograph does not show the marker), ``truth`` (N,)
-    and ``truth_std`` (N, 6) as a record's ``source`` and ``std``, and ``on_board``: the marker of
-    a board that each is, or None.
+    and ``truth_std`` (N, 6) as a record's ``source`` and ``std``, ``absent`` (N,), the detection's
+    flag where there is no pose, and ``on_board``: the marker of a board that each is, or None.
 
     Parameters
     ----------
@@ -222,6 +222,8 @@ def recorded_poses(
         "x_m": translation[:, 0], "y_m": translation[:, 1], "distance_m": translation[:, 2],
         "resolved_tilt_deg": tilt, "resolved_azimuth_deg": azimuth, "resolved_roll_deg": roll,
         "truth": source, "truth_std": std,
+        "absent": np.where(source == TruthSource.none, DetectionStatus.no_board,
+                           DetectionStatus.not_in_photograph),
     }
     if simulated:
         columns["neighbourhood"] = [each and with_neighbours(

@@ -180,7 +180,7 @@ class Tolerance:
 #: Detections of a scene for which not even the truth may be known.
 LOST = (
     DetectionStatus.failed, DetectionStatus.crashed, DetectionStatus.not_needed,
-    DetectionStatus.not_in_photograph,
+    DetectionStatus.not_in_photograph, DetectionStatus.no_board,
 )
 
 #: Detections of a scene in which a corner may be behind the camera: the marker has no image.

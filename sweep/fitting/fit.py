@@ -603,8 +603,8 @@ def fit_scene(
     ]
     fits = list(found.values())
     terms = _terms(fits, optics, tested, refused, decimation)
-    markers = sum(len(fit.states) for fit in fits)
-    return SceneFit(tuple(terms), len(fits), markers, views, tested_fits)
+    return SceneFit(
+        tuple(terms), len(fits), sum(len(fit.states) for fit in fits), views, tested_fits)
 
 
 def _fitted(views: Views, moved: Masks, start: Floats) -> dict[int, PhotographFit]:

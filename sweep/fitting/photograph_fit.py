@@ -503,8 +503,7 @@ def fit_photograph(
             for each in states
         ]
     result = shared.copy()
-    if moved.any():
-        result[moved] += _shared_step(states, moved)
+    result[moved] += _shared_step(states, moved)
     return PhotographFit(result, tuple(states), *flat_pixels(states))
 
 

@@ -96,16 +96,14 @@ class DetectionStatus(Flag):
         counted=False,
     )
     not_on_board = flag(11, "The scene's board has fewer markers than another.", counted=False)
+    no_board = flag(12, "The photograph shows no marker of its board: all of them are missed.")
 
 
 class TruthSource(Flag):
     """Origin of the true pose of a marker in a photograph."""
 
     not_run = flag(0, "The pose was not computed.", counted=False)
-    none = flag(
-        1, "There is no truth: errors are differences from a pose estimated from the marker's own "
-        "corners.",
-    )
+    none = flag(1, "There is no truth: errors are differences from a pose by the own corners.")
     board_without_this_marker = flag(
         2, "The pose of the board, fitted to all its corners except those of this marker.",
         present=True,

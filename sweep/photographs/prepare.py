@@ -320,17 +320,21 @@ def _summary(sides: Sequence[Side], dictionary: str) -> list[str]:
             sides[0].shots.photographs[0].path.parent,
             f"no photograph shows a whole marker of {dictionary} whose pose is known",
         )
-    with_pose = shown.any(axis=2)
-    empty = [Path(records[k].paths[i]).name for k, i in np.argwhere(~with_pose).tolist()]
-    count = int(with_pose.any(axis=0).sum())
-    share = shown.sum() / (shown.sum() + len(empty) * shown.shape[2])
-    lines = [(f"no pose of a marker is known in {folder.named(empty)}: not counted; with all of "
-              f"their markers missed, rates would be {share:.2f} times as large")] if empty else []
     std, translation, sources = (
-        np.array([getattr(each, name) for each in records])[shown]
+        np.array([getattr(each, name) for each in records])
         for name in ("std", "translation", "source")
     )
-    source, spread = TruthSource(int(sources[0])).name.replace("_", " "), ""
+    empty = ~shown.any(axis=2)
+    lost = empty & (sources == TruthSource.none).any(axis=2)
+    lines = [
+        words.format(folder.named([Path(records[k].paths[i]).name for k, i in np.argwhere(some)]))
+        for some, words in (
+            (lost, "no marker of the board is seen in {}: all of them count as missed"),
+            (empty & ~lost, "no pose of a marker is known in {}: not counted"),
+        ) if some.any()
+    ]
+    std, translation = std[shown], translation[shown]
+    source, spread = TruthSource(int(sources[shown][0])).name.replace("_", " "), ""
     if np.isfinite(std).any():
         turn = np.degrees(np.linalg.norm(std[:, :3], axis=1))
         spread = (
@@ -339,6 +343,7 @@ def _summary(sides: Sequence[Side], dictionary: str) -> list[str]:
         )
     what = "photographs" if len(records) == 1 else "pairs of photographs"
     away = f"{translation[:, 2].min():.3g} to {translation[:, 2].max():.3g} m away"
+    count = (~empty).any(axis=0).sum()
     return [*lines, f"{shown.sum():,} markers, {away}, in {count} {what}; truth: {source}{spread}"]
 
 
@@ -505,6 +510,8 @@ MIN_HALF = 5
 def board_poses(side: Side, board: Board, found: Sequence[FoundCorners]) -> float:
     """Write the poses of a board's markers in photographs, of markers wholly in them.
 
+    Where no marker is seen, such as in a blurred photograph, all count as missed.
+
     Parameters
     ----------
     side
@@ -524,6 +531,8 @@ def board_poses(side: Side, board: Board, found: Sequence[FoundCorners]) -> floa
     raised = _halves_ratio(camera, boards, found, 1 if len(board.chessboard_m) else 4)
     column = np.argsort(np.argsort(board.marker_ids)).tolist()
     own = folder.own_corners(board)
+    side.record.source[[not (len(each.ids) or each.repeated) for each in side.seen]] = (
+        TruthSource.none)
     for photograph, (pose, corners) in enumerate(zip(boards, found, strict=True)):
         if pose is None:
             continue
@@ -547,8 +556,7 @@ def board_poses(side: Side, board: Board, found: Sequence[FoundCorners]) -> floa
                 )
             side.put((photograph, column[k]), fitted.rotation, fitted.translation,
                      TruthSource.board_without_this_marker, np.sqrt(variance))
-    known = [each.rms_px for each in boards if each is not None]
-    return float(np.median(known)) if known else np.nan
+    return float(np.median([each.rms_px for each in boards if each is not None] or [np.nan]))
 
 
 def unshared_variance(
@@ -676,7 +684,7 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
     detectors, estimators, rows and flags are the photographs' own, so that results pair: trial
     k has the poses of photograph k modulo their number. What is drawn of the scene is drawn for
     each photograph and repeat, and is the same for all its markers; noise and shifts are each
-    marker's own.
+    marker's own. What counts as missed in photographs that do not show their board does so here.
 
     Parameters
     ----------

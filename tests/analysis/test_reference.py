@@ -95,7 +95,7 @@ def expected_flips(found):
             **rate("flip_rate", solved, hits)}
 
 
-OF_LOOKED_FOR = ("solved", "wrong_id", "rejected", "no_candidate", "solver_failed",
+OF_LOOKED_FOR = ("solved", "wrong_id", "rejected", "no_candidate", "no_board", "solver_failed",
                  "not_converged", "not_explained", "too_few_points", "failed", "crashed")
 OUTCOMES = (*OF_LOOKED_FOR, "not_visible", "not_modelled", "not_in_photograph", "not_on_board",
             "not_run", "not_needed")

@@ -226,5 +226,5 @@ def test_what_is_left_out_and_converted_is_said(faulty, tmp_path):
     said = "\n".join(made.lines)
     for words in ("left out notes.txt", "left out cut.jpg", "the same photographs again",
                   "\\udcff.png: its name is not UTF-8", "have 16 bits", "are in colour",
-                  "known in blurred.png: not counted; with all of their markers missed, rates"):
+                  "seen in blurred.png: all of them count as missed"):
         assert words in said

@@ -406,15 +406,15 @@ def calibrate(
     if fault:
         raise ArgumentError("camera", "calibrate", fault)
     fx, fy, cx, cy, *distortion = made.values.tolist()
-    sd = tuple(made.std.tolist())
-    camera = Calibration(*size, fx, fy, cx, cy, tuple(distortion), sd, ())
+    camera = Calibration(*size, fx, fy, cx, cy, tuple(distortion), tuple(made.std.tolist()), ())
     numbers = ", ".join(
         f"{name} {value:.1f} ± {sd:.1f}"
         for name, value, sd in zip(("fx", "fy", "cx", "cy"), made.values, made.std, strict=False)
     )
     line = (
         f"camera: calibrated from {made.views} photographs, {made.rms_px:.2f} px RMS: {numbers} px "
-        "(standard deviations; truth_std has of them what truth and estimates do not share)"
+        "(standard deviations; truth_std has of them what truth and estimates do not share, the "
+        "interval of a fit's marker_scale nothing: it is too narrow)"
     )
     covariance = _covariance(camera, [used[i] for i in made.used], made)
     return replace(camera, covariance=tuple(covariance.ravel().tolist())), line

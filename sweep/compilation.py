@@ -22,26 +22,27 @@ try:
 except (ValueError, TypeError) as error:  # it reads its configuration while it is imported
     raise RunError(f"Numba cannot be imported with its NUMBA_... variables: {error}") from None
 
+untyped_numba: Any = numba  # whose types lack options
+
 #: Rooms with compiled functions.
 ROOMS = ("model", "measure", "fitting")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def compiled(function: Function, *, forceinline: bool = False) -> Function:
+def compiled(function: Function, *, forceinline: bool = False, packed: bool = False) -> Function:
     """Compile ``function`` to machine code on its first call and cache it on disk.
 
     IEEE arithmetic is kept in source order (no ``fastmath``), so that results do not depend on
     how loops were vectorised; the global interpreter lock is released while it runs.
     """
-    njit: Any = numba.njit  # whose types lack an option
-    dispatcher: Any = njit(
+    dispatcher: Any = untyped_numba.njit(
         function, nogil=True, error_model="numpy", forceinline=forceinline, no_cfunc_wrapper=True
     )
     # Compilation may be switched off (AttributeError); where no folder can be written to
     # (RuntimeError), each process compiles for itself.
     with contextlib.suppress(AttributeError, RuntimeError):
-        dispatcher.compile = partial(_compile, dispatcher, dispatcher.compile)
+        dispatcher.compile = partial(_compile, packed, dispatcher, dispatcher.compile)
         dispatcher.enable_caching()
         # Numba compares a function's own file only. It would go on using code in which a function
         # of another file is inlined as that was.
@@ -49,13 +50,14 @@ def compiled(function: Function, *, forceinline: bool = False) -> Function:
     return cast("Function", dispatcher)
 
 
-def compiled_inline(function: Function) -> Function:
-    """As :func:`compiled`, for small functions that loops call: inlined in every caller.
+#: As :func:`compiled`, for small functions that loops call: inlined in every caller. LLVM by itself
+#: does not always do so, and a call costs as much as such a function: 5 to 20 ns. The arithmetic
+#: stays the same.
+compiled_inline = partial(compiled, forceinline=True)
 
-    LLVM by itself does not always do so, and a call costs as much as such a function: 5 to 20 ns.
-    The arithmetic stays the same.
-    """
-    return compiled(function, forceinline=True)
+#: As :func:`compiled`; several like statements on neighbours in memory are computed at once (LLVM's
+#: SLP vectoriser, which Numba leaves out). The arithmetic stays the same.
+compiled_packed = partial(compiled, packed=True)
 
 
 def is_cached(module: str, name: str) -> bool:
@@ -66,11 +68,13 @@ def is_cached(module: str, name: str) -> bool:
     return not hasattr(function, "_cache")
 
 
-def _compile(dispatcher: Any, compile_signature: Callable[[Any], Any], signature: Any) -> Any:
+def _compile(packed: bool, dispatcher: Any, compile_signature: Any, signature: Any) -> Any:
     """Compile or load a function for a signature.
 
     Constants of a caller count as integers: not once for each constant.
     """
+    config = untyped_numba.config
+    before, config.SLP_VECTORIZE = config.SLP_VECTORIZE, packed
     try:
         return compile_signature(tuple(map(numba.types.unliteral, signature)))
     except (numba.errors.NumbaError, MachineFaultError):
@@ -80,6 +84,8 @@ def _compile(dispatcher: Any, compile_signature: Callable[[Any], Any], signature
             f"compiled code in {dispatcher.stats.cache_path} cannot be loaded or saved "
             f"({type(error).__name__}: {error}): delete its .nbi and .nbc files"
         ) from error
+    finally:
+        config.SLP_VECTORIZE = before  # a caller's, whose compilation compiles what it calls
 
 
 @cache

@@ -65,7 +65,7 @@ BACKGROUND_MARGIN_PX = 4
 
 #: Abandon a start after more than this many consecutive steps that predict a chi-square above
 #: ``worth``.
-PATIENCE = 2
+PATIENCE = 1
 
 
 class Sheets(NamedTuple):
@@ -490,17 +490,15 @@ def descend(
             step = gradient.copy().reshape(free, 1)
             for k in range(free):
                 damped[k, k] += damping * information[k, k] + 1e-300
-            if not solve_positive(damped, step):
-                damping = max(10.0 * damping, 1e-3)
-                continue
-            trial = moved_state(state, step[:, 0], view.least_spread_px)
-            if is_before_camera(trial, view):
-                trial_squares = squared_residuals(
-                    seen, trial, work, trial_information, trial_gradient
-                )
-                if trial_squares < squares:
-                    accepted = True
-                    break
+            if solve_positive(damped, step):
+                trial = moved_state(state, step[:, 0], view.least_spread_px)
+                if is_before_camera(trial, view):
+                    trial_squares = squared_residuals(
+                        seen, trial, work, trial_information, trial_gradient
+                    )
+                    if trial_squares < squares:
+                        accepted = True
+                        break
             damping = max(8.0 * damping, 1e-3)
         if not accepted:
             break

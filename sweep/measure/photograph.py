@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sweep.compilation import compiled, compiled_inline
+from sweep.compilation import compiled, compiled_inline, compiled_packed
 from sweep.measure import likelihood
 from sweep.measure.estimation import solve_positive
 from sweep.measure.likelihood import BLACK, DEPTH, OUTSIDE, OUTSIDE_SHARE, SPREAD, TONE, WHITE
@@ -43,6 +43,10 @@ MOST_NODES, MAX_PANELS = 24, 4096
 _GAUSS = np.zeros((MOST_NODES + 1, 2, MOST_NODES))
 for _n in range(1, MOST_NODES + 1):
     _GAUSS[_n, :, :_n] = np.polynomial.legendre.leggauss(_n)
+
+#: Distance of an edge's middle from its chord above which it is drawn in pieces: the curve through
+#: three points is within 0.005 px of what a lens makes of such a piece.
+MOST_BEND_PX = 0.1
 
 #: Nodes of a panel, and of each standard deviation of the point spread along it: 3e-4 of the jump.
 END_NODES, NODES_A_DEVIATION = 2.0, 0.85
@@ -108,7 +112,7 @@ def _taps(sigma: float) -> Floats:
     (places, 4 · taps): of each pixel from the first in reach on the step of the share of what is
     beyond the point, its slope twice, and the slope's slope over twice the standard deviation.
     """
-    reach = REACH * sigma + 0.5
+    reach = REACH * sigma
     most, places = int(2.0 * reach) + 3, math.ceil(PHASES / sigma)
     taps = np.empty((places + 1, 4 * most))
     for place in range(places + 1):
@@ -118,7 +122,7 @@ def _taps(sigma: float) -> Floats:
         for m in range(most):
             at += 1.0
             high, high_sum, high_density = _normal(at, sigma)
-            share = 1.0 if m == most - 1 else high_sum - low_sum
+            share = high_sum - low_sum
             row[4 * m] = share - before
             row[4 * m + 1] = row[4 * m + 2] = high - low
             row[4 * m + 3] = 0.5 * (high_density - low_density) / sigma
@@ -138,7 +142,7 @@ def _add_edge(
     rates, outsides = out.rates, out.outside
     height, width = outsides.shape[0], outsides.shape[1] - 1
     xa, ya, xm, ym, xb, yb = ends
-    reach, most, places = REACH * sigma + 0.5, taps.shape[1] // 4, len(taps) - 1
+    reach, most, places = REACH * sigma, taps.shape[1] // 4, len(taps) - 1
     if min(xa, xb) > width + reach or min(ya, yb) > height + reach or max(ya, yb) < -reach:
         return
     needed = NODES_A_DEVIATION * math.hypot(xb - xa, yb - ya) / max(sigma, MIN_SPREAD_PX)
@@ -155,8 +159,8 @@ def _add_edge(
         left = xa + t * (slope_x + t * bend_x) - reach
         upper = ya + t * (slope_y + t * bend_y) - reach
         first, top = math.floor(left), math.floor(upper)
-        begin, end = max(first, 0), min(first + most, width)
-        start, stop = max(top, 0), min(top + most, height)
+        begin, end = max(first, 0), min(math.ceil(left + 2.0 * reach) + 1, width)
+        start, stop = max(top, 0), min(math.ceil(upper + 2.0 * reach), height)
         if first >= width or start >= stop:
             continue
         weight_x = weight * (slope_y + 2.0 * t * bend_y)
@@ -220,13 +224,13 @@ def add_plane(
         edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
         x, y = polygon.edge_pixel(0.0, edge, projection, flat)
         u, v = polygon.edge_pixel(1.0, edge, projection, flat)
-        # The curve through three points is within 0.005 px of what a lens makes of such pieces.
-        pieces = 1
-        if projection.optics.distorted:
-            pieces += polygon.chord_count(edge, 0, 1, (x, y, u, v), projection, flat) // 32
+        xm, ym = polygon.edge_pixel(0.5, edge, projection, flat)
+        bend = abs((xm - x) * (v - y) - (ym - y) * (u - x)) / max(math.hypot(u - x, v - y), 1e-9)
+        pieces = min(1 + int(math.sqrt(bend / MOST_BEND_PX)), MAX_PANELS)
         for piece in range(pieces):
-            xm, ym = polygon.edge_pixel((piece + 0.5) / pieces, edge, projection, flat)
-            u, v = polygon.edge_pixel((piece + 1.0) / pieces, edge, projection, flat)
+            if pieces > 1:
+                xm, ym = polygon.edge_pixel((piece + 0.5) / pieces, edge, projection, flat)
+                u, v = polygon.edge_pixel((piece + 1.0) / pieces, edge, projection, flat)
             _add_edge(out, taps, jump, outside, sigma, (
                 x + 0.5, y + 0.5, xm + 0.5, ym + 0.5, u + 0.5, v + 0.5))
             x, y = u, v
@@ -439,7 +443,7 @@ def normal_equations(view: PhotographView, state: Floats, work: System, matrix: 
             matrix[k, m] = matrix[m, k] = sums[k, m]
 
 
-@compiled
+@compiled_packed
 def add_products(columns: Floats, count: int, sums: Floats) -> None:
     """Add the products of the columns of ``count`` pixels to the tiles of the lower triangle."""
     for k in range(0, sums.shape[0], TILE):
@@ -453,26 +457,26 @@ def add_tile(left: Floats, k: int, right: Floats, m: int, count: int, sums: Floa
     s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = 0.0
     s20 = s21 = s22 = s23 = s30 = s31 = s32 = s33 = 0.0
     for p in range(count):
-        row, other = left[p], right[p]
-        a0, a1, a2, a3 = row[k], row[k + 1], row[k + 2], row[k + 3]
-        b0, b1, b2, b3 = other[m], other[m + 1], other[m + 2], other[m + 3]
+        row, other = left[p, k : k + TILE], right[p, m : m + TILE]
+        a0, a1, a2, a3 = row[0], row[1], row[2], row[3]
+        b0, b1, b2, b3 = other[0], other[1], other[2], other[3]
         s00, s01, s02, s03 = s00 + a0 * b0, s01 + a0 * b1, s02 + a0 * b2, s03 + a0 * b3
         s10, s11, s12, s13 = s10 + a1 * b0, s11 + a1 * b1, s12 + a1 * b2, s13 + a1 * b3
         s20, s21, s22, s23 = s20 + a2 * b0, s21 + a2 * b1, s22 + a2 * b2, s23 + a2 * b3
         s30, s31, s32, s33 = s30 + a3 * b0, s31 + a3 * b1, s32 + a3 * b2, s33 + a3 * b3
-    _add_to_row(sums[k], m, s00, s01, s02, s03)
-    _add_to_row(sums[k + 1], m, s10, s11, s12, s13)
-    _add_to_row(sums[k + 2], m, s20, s21, s22, s23)
-    _add_to_row(sums[k + 3], m, s30, s31, s32, s33)
+    _add_to_row(sums[k, m : m + TILE], s00, s01, s02, s03)
+    _add_to_row(sums[k + 1, m : m + TILE], s10, s11, s12, s13)
+    _add_to_row(sums[k + 2, m : m + TILE], s20, s21, s22, s23)
+    _add_to_row(sums[k + 3, m : m + TILE], s30, s31, s32, s33)
 
 
 @compiled_inline
-def _add_to_row(row: Floats, m: int, a: float, b: float, c: float, d: float) -> None:
-    """Add four numbers to a row from column m on."""
-    row[m] += a
-    row[m + 1] += b
-    row[m + 2] += c
-    row[m + 3] += d
+def _add_to_row(row: Floats, a: float, b: float, c: float, d: float) -> None:
+    """Add four numbers to a row."""
+    row[0] += a
+    row[1] += b
+    row[2] += c
+    row[3] += d
 
 
 @compiled
@@ -772,7 +776,7 @@ def _products(view: PhotographView, state: Floats, images: Floats) -> Floats:
     return sums
 
 
-@compiled
+@compiled_packed
 def _correlated_products(
     field: Floats, view: PhotographView, across: float, along: float
 ) -> Floats:

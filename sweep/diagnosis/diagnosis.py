@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sweep.diagnosis import inference
-from sweep.diagnosis.observations import READABLE_PX, ZERO_SD_M, Observations, read_observations
+from sweep.diagnosis.observations import ZERO_SD_M, Observations, read_observations
 from sweep.model.calibration import Calibration
 from sweep.report.figure import Figure, write_figure
 from sweep.report.output_file import figure_file
@@ -86,19 +86,19 @@ def diagnose(
     ranked = inference.rank(rows)
     shown = [each for each in ranked[:SHOWN] if each.probability >= LEAST_SHARE] or ranked[:1]
     if figure is not None:
-        write_figure([residual_figure(rows, shown)], figure)
+        write_figure([residual_figure(shown)], figure)
     first, open_ = ranked[0], inference.rivals(ranked)
     measurement = inference.next_measurement(rows, first, open_[0]) if open_ else None
     sentence = _sentence(rows, first, open_, measurement)
     sizes = [size_of(each, rows) for each in shown]
     causes = Table.of(
         "Causes by posterior probability", ("cause", "probability", "misfit", "its size"),
-        [(each.words("name"), number(each.probability), number(each.misfit[each.best]), size)
+        [(each.words("name"), number(each.probability), number(each.misfit[0]), size)
          for each, size in zip(shown, sizes, strict=True)], words=True)
-    single = {cause.name: cause for each in shown for cause in each.causes}
     tests = Table.of(
         "What they mean, and the test that decides", ("cause", "meaning", "test"),
-        [(cause.name, cause.title, cause.test) for cause in single.values()], words=True)
+        [(cause.name, cause.title, cause.test) for cause in dict.fromkeys(
+            cause for each in shown for cause in each.causes)], words=True)
     row, component = rows.cells
     value, components = rows.measured[rows.cells], [("x", "y", "z", "tape")[k] for k in component]
     predictions = Table.of(
@@ -113,7 +113,7 @@ def diagnose(
         "causes": [{
             "causes": sorted(each.names) or [inference.AGREE], "title": each.words("title"),
             "probability": each.probability, "size": size,
-            "misfit": float(each.misfit[each.best]), "test": each.words("test", "; "),
+            "misfit": float(each.misfit[0]), "test": each.words("test", "; "),
             "predicted_m": each.fitted} for each, size in zip(shown, sizes, strict=True)],
         "cannot_tell": [each.words("name") for each in (first, *open_)] if open_ else [],
         "measure_next": None if measurement is None else measurement._asdict(),
@@ -135,12 +135,16 @@ def size_of(each: inference.Explanation, rows: Observations) -> str:
     for cause, way in zip(each.causes, each.way, strict=True):
         (scale, unit), ratio, spread = cause.unit, way["ratio"][0], way["spread"][0]
         columns = cause.columns(rows, np.ones((1, 1, 3)), np.ones(1))
-        for axis, _, (mean, sd) in zip("xyz", columns, numbers, strict=False):
-            texts.append(f"said is {ratio / (1.0 + spread * mean):.4g} times the truth "
-                         f"(± {100.0 * spread * sd:.2g} %)" if spread else
-                         f"{f'{axis} ' * (len(columns) > 1)}"
-                         f"{scale * mean:+.2f} ± {scale * sd:.2g} {unit}")
-    return "; ".join([*texts, *(label for way in each.way for label in way["label"] if label)])
+        sizes = [
+            f"said is {ratio / (1.0 + spread * mean):.4g} times the truth "
+            f"(± {100.0 * spread * sd:.2g} %)" if spread else
+            f"{f'{axis} ' * (len(columns) > 1)}{scale * mean:+.2f} ± {scale * sd:.2g} {unit}"
+            for axis, _, (mean, sd) in zip("xyz", columns, numbers, strict=False)]
+        if way["label"][0]:
+            sizes.append(" or ".join(dict.fromkeys(filter(None, way["label"]))))
+        if sizes:
+            texts.append(f"{cause.name}: " * (len(each.causes) > 1) + ", ".join(sizes))
+    return "; ".join(texts)
 
 
 def _sentence(
@@ -148,13 +152,13 @@ def _sentence(
     measurement: inference.Measurement | None,
 ) -> str:
     """Return the answer in one sentence, with what to do."""
-    misfit, test = float(first.misfit[first.best]), first.words("test", "; ")
+    misfit, test = float(first.misfit[0]), first.words("test", "; ")
     count = len(rows.cells[0])
     if misfit - count > np.sqrt(2.0 * SURPRISING * count) or (
             first.yaw_evidence < SURPRISING_YAW * np.isfinite(rows.yaw_off[:, 0]).sum()):
-        return (f"{UNEXPLAINED}: look for a mistaken row, or a wrong sign of "
-                "yaw_deg, or state larger standard deviations.")
-    if not first.names and (rows.side_px < READABLE_PX).any():
+        return (f"{UNEXPLAINED}: look for a mistaken row, a distortion that the camera's "
+                "file lacks, or a wrong sign of yaw_deg, or state larger standard deviations.")
+    if not first.names and (rows.side_px < inference.SIDE_LIMITS_PX[0]).any():
         return ("What was said agrees with what was measured, but no detector reads a square of "
                 f"{rows.side_px.min():.2g} px: are size_m and all distances in metres?")
     if not first.names:
@@ -178,14 +182,12 @@ def _sentence(
             f"differ by {measurement.difference:.1f} standard deviations; or {test}.")
 
 
-def residual_figure(rows: Observations, shown: Sequence[inference.Explanation]) -> Figure:
+def residual_figure(shown: Sequence[inference.Explanation]) -> Figure:
     """Return a figure of measured minus predicted, in standard deviations, by cause and value."""
-    value = rows.measured[rows.cells]
     heading = Column("measured - predicted, standard deviations", "residual", level=0.0)
     table = Table.of("What each cause leaves unexplained", (
         "cause", "measured value, in the order of the rows", heading.heading), [
         (each.words("name"), k + 1, Value(float(residual)))
-        for each in shown for k, residual in enumerate(
-            (value - each.fitted) / each.sd)], stub=2)
+        for each in shown for k, residual in enumerate(each.residuals)], stub=2)
     return Figure("residuals", table.caption, "", table, [heading],
                   x=table.headings[1], by="cause")

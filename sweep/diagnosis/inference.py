@@ -74,7 +74,7 @@ def ways_of(
 
 def undone(ways: Sequence[Ways]) -> Floats:
     """Return said position to true one (c, 3, 3) by ways (c,) of several causes together."""
-    return functools.reduce(np.matmul, (each["matrix"] for each in ways))
+    return functools.reduce(np.matmul, (each["matrix"] for each in ways), np.eye(3)[None])
 
 
 @dataclass(frozen=True)
@@ -194,9 +194,8 @@ def _focal_ways(rows: Observations) -> Ways:
         return alone
     crop = _moved_centre(rows, np.outer(
         1.0 - 1.0 / ratio, [rows.camera.cx_px, rows.camera.cy_px]))
-    resized = crop.copy()
-    resized[:, 2, 2] = 1.0 / ratio
     alone["log_weight"] += math.log(0.7)
+    resized = alone["matrix"][: len(ratio)] @ crop
     return np.concatenate([
         alone, ways_of(resized, [*FOCAL_RATIOS.values()], 1.0, ratio, NAMED_SD, share=0.2),
         ways_of(crop, [*FOCAL_RATIOS.values()], spread=NAMED_SD, share=0.1)])
@@ -255,12 +254,13 @@ def _scaled(_: Observations, points: Floats, spread: Floats) -> Sequence[Floats]
 AGREE = "agree"
 FLIPS = "flips"
 STRAIGHT = "z_for_range"
+FOCAL = "focal_length"
 CAUSES = (
     Cause(AGREE, "the numbers agree with what is expected", 4.0, "nothing to test"),
     Cause("size", "wrong size of the marker (another edge, or a scaled or bent print)", 3.0,
           "measure the square whose corners are detected with a caliper, flat on a table",
           lambda rows: ratios(size_ratios(rows.dictionary), 0.6, (1, 1, 1), 0.05), _scaled),
-    Cause("focal_length", "wrong focal length (resolution, another camera, crop, autofocus)", 2.5,
+    Cause(FOCAL, "wrong focal length (resolution, another camera, crop, autofocus)", 2.5,
           "photograph a ruler at a known distance: f is its pixels times distance / length; "
           "compare the file's image size with the image's",
           _focal_ways, lambda _, points, spread: [points * spread * [0.0, 0.0, 1.0]]),
@@ -272,30 +272,30 @@ CAUSES = (
     Cause("offset", "an offset (zero point of the tape, place of the lens, another frame)", 1.0,
           "measure one more distance: an offset stays, a factor grows",
           columns=lambda rows, points, _: [*(OFFSET_SD_M * (
-              np.eye(3) if rows.spatial else along_sight(points)[None]))],
-          unit=(1e3 * OFFSET_SD_M, "mm")),
+              np.eye(3) if (rows.cells[1] < 3).any() else along_sight(points)[None]))],
+          unit=(1e3 * OFFSET_SD_M, "mm to add")),
     Cause("axes", "axes or frame turned", 1.0,
           "move the marker to the right: x alone must grow; down: y; away: z",
           _axis_ways,
           lambda _, points, _spread: [
               np.radians(TURN_SD_DEG) * np.cross(axis, points) for axis in np.eye(3)],
-          _lateral, (TURN_SD_DEG, "degrees")),
+          _lateral, (TURN_SD_DEG, "degrees to turn")),
     Cause("half_pixel", "half a pixel (convention of corners or calibration)", 0.7,
           "detect a rendered marker whose corners are known (`sweep export`)",
           lambda rows: ways_of(_moved_centre(rows, np.array([[0.5, 0.5], [-0.5, -0.5]])), [
-              f"centres of pixels counted from {one} in one place, from {other} in the other"
+              f"pixels' centres counted from {one} in one place, from {other} in the other"
               for one, other in (("0.5", "0"), ("0", "0.5"))]),
           lacks=lambda rows: _lateral(rows) or _known_square(rows)),
     Cause("refinement", "bias of the corner refinement", 1.0,
           "run the other refinement on the same images: its bias differs",
           columns=lambda rows, points, _: [-BIAS_SD_PX / rows.side_px[:, None] * points],
-          lacks=_known_square, unit=(BIAS_SD_PX, "px")),
+          lacks=_known_square, unit=(BIAS_SD_PX, "px too far")),
     Cause("motion", "motion during the exposure, a rolling shutter or a late time stamp", 1.0,
           "measure standing still",
           columns=lambda rows, points, _: [
               DELAY_SD_S * np.nan_to_num(rows.speed)[:, None] * along_sight(points)],
           lacks=lambda rows: "" if np.nan_to_num(rows.speed).any() else "speed_m_s",
-          unit=(1e3 * DELAY_SD_S, "ms")),
+          unit=(1e3 * DELAY_SD_S, "ms late")),
     Cause(FLIPS, "flips (the mirrored solution of the plane)", 0.5,
           "print both solutions of solvePnPGeneric with their reprojection errors",
           lacks=lambda rows: "" if np.isfinite(rows.yaw_off).any()
@@ -334,16 +334,14 @@ class Explanation:
         Logarithm of the prior weight times the marginal likelihood.
     misfit
         Squared distance (c,) of what was measured from the prediction of each way in which they
-        are undone, in standard deviations, with all that is unknown.
-    best
-        The likeliest way.
+        are undone, the likeliest first, in standard deviations, with all that is unknown.
     way
-        That way alone, of each cause.
+        The likeliest way of each cause, and after it those that are not told from it.
     numbers, covariance
         Posterior mean (k,) and covariance (k, k) of its unknown numbers, in prior standard
         deviations: the causes' own first, then bias and zero points.
-    fitted, sd
-        Expected readings of the tape (d,), and the standard deviations of its noise.
+    fitted, residuals
+        Expected readings of the tape (d,), and what they leave, in standard deviations.
     yaw_evidence
         Log-likelihood of the measured yaws, relative to yaws as they were said.
     probability
@@ -353,12 +351,11 @@ class Explanation:
     causes: tuple[Cause, ...]
     log_evidence: float
     misfit: Floats
-    best: int
     way: Sequence[Ways]
     numbers: Floats
     covariance: Floats
     fitted: Floats
-    sd: Floats
+    residuals: Floats
     yaw_evidence: float
     probability: float = math.nan
 
@@ -379,13 +376,26 @@ def predict(
 
     Of all measured numbers (c, d), how unknown numbers change them (c, d, k), and the variance of
     their noise (c, d).
+
+    Notes
+    -----
+    A plane through an image's ray at the angle b to the axis is shown larger by 1 / cos b across,
+    and by 1 / cos² b away from the axis. So a solver that believes another lens, and another b,
+    finds a marker parallel to the image where the way says, and others nearer or farther by up to
+    the ratio of both cosines, as they are tilted, which is not known: half of it, with that
+    standard deviation, is expected.
     """
     bias, bias_sd, noise, lateral = rows.expected
     row, component = rows.cells
     points = np.einsum("cij,nj->cni", undone(ways), rows.said)
     square = np.prod([each["square"] for each in ways], axis=0)[:, None]
     side = np.clip(rows.side_px * square, *SIDE_LIMITS_PX)[..., None]
-    points = points * (1.0 - bias / side)
+    lens = undone([way for way, cause in zip(ways, causes, strict=True) if cause.name == FOCAL])
+    # In other axes z is no depth: no lens of a pinhole camera sees beyond 60 degrees.
+    true, believed = (np.maximum(along_sight(each)[..., 2:], 0.5) for each in (
+        points, points @ np.linalg.inv(lens).transpose(0, 2, 1)))
+    slant = 0.5 * np.log(believed / true)
+    points = points * np.exp(slant) * (1.0 - bias / side)
     sight = along_sight(points)
     # Change of what is measured with the position: a component, or along the line of sight.
     # The tape is straight; who finds z wrong has compared z with it, if no cause explains it.
@@ -403,10 +413,10 @@ def predict(
     # near would explain many rows by less noise.
     known = np.fmax(rows.measured[:, 3], rows.measured[:, 2])
     distance = np.where(np.isfinite(known), np.abs(known), np.linalg.norm(points, axis=-1))[:, row]
-    focal = rows.camera.fx_px if rows.camera is not None else 1000.0
+    across = lateral / (rows.camera.fx_px if rows.camera is not None else 1000.0)
     along = (onto * sight[:, row]).sum(axis=-1)
     variance = rows.measured_sd[row, component] ** 2 + distance**2 * (
-        (along * noise / side[:, row, 0]) ** 2 + (1.0 - along**2) * (lateral / focal) ** 2)
+        along**2 * ((noise / side) ** 2 + slant**2)[:, row, 0] + (1.0 - along**2) * across**2)
     return (points[:, row] * onto).sum(axis=-1), np.stack(seen, axis=-1), variance
 
 
@@ -436,11 +446,12 @@ def explain(rows: Observations, causes: tuple[Cause, ...], log_prior: float) -> 
     joint = sum(each["log_weight"] for each in ways) - 0.5 * (
         misfit + np.log(2.0 * math.pi * variance).sum(axis=-1) + np.log(precision).sum(axis=-1))
     yaw = _yaw_evidence(rows, FLIP_SHARE if any(cause.name == FLIPS for cause in causes) else 0.0)
-    k = int(np.argmax(joint))
+    likeliest = np.argsort(-joint, kind="stable")
+    near, k = likeliest[joint[likeliest] > joint.max() - math.log(CLEAR_ODDS)], likeliest[0]
     return Explanation(
-        causes, float(np.logaddexp.reduce(joint)) + log_prior + yaw, misfit, k,
-        [each[[k]] for each in ways], numbers[k], covariance[k],
-        mean[k] + columns[k] @ numbers[k], np.sqrt(variance[k]), yaw)
+        causes, float(np.logaddexp.reduce(joint)) + log_prior + yaw, misfit[likeliest],
+        [each[near] for each in ways], numbers[k], covariance[k],
+        mean[k] + columns[k] @ numbers[k], left[k] / np.sqrt(variance[k]), yaw)
 
 
 def _yaw_evidence(rows: Observations, flipped_share: float) -> float:

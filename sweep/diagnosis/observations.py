@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,7 +49,7 @@ NEEDED = {
 # Column -> numbers between which it can be, in whatever unit.
 MOST_M = 1e7
 RANGES = {
-    **dict.fromkeys((*TVEC, *RVEC, *MEASURED, "yaw_deg", "speed_m_s"), (-MOST_M, MOST_M)),
+    **dict.fromkeys(COLUMNS, (-MOST_M, MOST_M)),
     **dict.fromkeys(("range_m", "tape_m"), (1e-5, MOST_M)),
     **dict.fromkeys(("tape_sd_m", "position_sd_m", "yaw_sd_deg"), (1e-9, MOST_M))}
 
@@ -80,9 +79,6 @@ UNKNOWN_SIDE_PX = 80.0
 
 # Rows that are judged within ten seconds and a gigabyte.
 MAX_ROWS = 200
-
-# Sides below this cannot be read: the numbers are in other units than the size.
-READABLE_PX = 4.0
 
 
 # Settings of `sweep diagnose`.
@@ -131,8 +127,6 @@ class Observations:
         Positions (n, 3) of the marker, m, camera frame; (0, 0, range) where only a range is known.
     lateral
         Whether the program's x and y are known.
-    spatial
-        Whether positions were measured, and not straight distances alone.
     measured, measured_sd
         Measured x, y, z and straight distance from the lens to the marker's centre (n, 4), m, NaN
         where unknown, and their standard deviations (n, 4).
@@ -155,7 +149,6 @@ class Observations:
 
     said: Floats
     lateral: bool
-    spatial: bool
     measured: Floats
     measured_sd: Floats
     yaw_off: Floats
@@ -251,7 +244,7 @@ def read_observations(
     turns = [np.degrees(np.arctan2(each[:, 0, 2], -each[:, 2, 2]))
              for each in (rotation, mirrored(rotation, said))]
     rows = Observations(
-        said, lateral, bool(np.isfinite(measured[:, :3]).any()), measured,
+        said, lateral, measured,
         np.where(np.isfinite(deviations), deviations, tape_sd(lengths)),
         table[["yaw_deg"]].to_numpy() - np.stack(turns, axis=-1),
         table["yaw_sd_deg"].fillna(YAW_SD_DEG).to_numpy(), table["speed_m_s"].to_numpy(),
@@ -288,12 +281,10 @@ def _cells(source: str | os.PathLike[str] | Mapping[str, Sequence[Any]]) -> pd.D
         raise ArgumentError("observations", given, plain(error)) from None
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     header, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines)] or [[]]
-    faults = [f"row {number} has {len(row)} cells, the header {len(header)}: expected commas "
-              "between columns, and points in numbers"
-              for number, row in enumerate(rows, 1) if len(row) != len(header)]
-    faults += [f"column {plain(name)} is there twice" for name in header if header.count(name) > 1]
-    if faults:
-        raise ArgumentError("observations", plain(source), faults[0])
+    _each_row([len(row) == len(header) for row in rows],
+              f"expected {len(header)} cells, commas between them, and points in numbers")
+    if repeated := [name for name in COLUMNS if header.count(name) > 1]:
+        raise _fault(f"column {repeated[0]} is there twice")
     return pd.DataFrame(rows, columns=header)
 
 
@@ -310,13 +301,12 @@ def _numbers(cells: pd.DataFrame) -> pd.DataFrame:
     table = cells.reindex(columns=COLUMNS).replace("", None)
     numbers = table.apply(pd.to_numeric, errors="coerce").astype(np.float64)
     for name in cells.columns.intersection(COLUMNS):
-        low, high = RANGES.get(name, (-sys.float_info.max, sys.float_info.max))
+        low, high = RANGES[name]
         wrong = table[name].notna() & ~numbers[name].between(low, high)
         if wrong.any():
             row = int(wrong.argmax())
-            extent = f" between {low:g} and {high:g}" if name in RANGES else ""
-            raise _fault(f"row {row + 1}, {name} = {plain(cells[name][row])}: expected a number"
-                         f"{extent}; leave the cell empty if it is unknown")
+            raise _fault(f"row {row + 1}, {name} = {plain(cells[name][row])}: expected a number "
+                         f"between {low:g} and {high:g}; leave the cell empty if it is unknown")
     return numbers
 
 

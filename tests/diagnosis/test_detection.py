@@ -9,8 +9,6 @@ from sweep.errors import DatasetError
 from sweep.measure.flags import EstimateStatus, Flipped
 from sweep.model.pose import mirrored, rotation_of_angles, rotation_of_vector, vector_of_rotation
 
-FOCAL_SIZE = 90.0
-
 
 def drawn(seed, count=6000):
     """Return a dataset of poses whose errors are normal, grow with 1 / side, and flip when far."""
@@ -19,7 +17,7 @@ def drawn(seed, count=6000):
     tvec = z[:, None] * np.column_stack([rng.uniform(-0.3, 0.3, (count, 2)), np.ones(count)])
     rotation = rotation_of_angles(*np.radians([
         rng.uniform(0, 60, count), rng.uniform(0, 360, count), rng.uniform(0, 360, count)]))
-    side = FOCAL_SIZE / z
+    side = 90.0 / z
     sd = np.array([2e-4, 2e-4, 1e-3, 2e-3, 2e-3, 1e-3]) * (90 / side)[:, None]
     error = rng.normal(0, 1, (count, 6)) * sd
     error[:, 2] += 0.002

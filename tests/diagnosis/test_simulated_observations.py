@@ -13,9 +13,9 @@ from sweep.diagnosis.observations import REFINEMENTS, Observations
 from sweep.model.calibration import Calibration
 
 TOLD, OPEN = 20.0, 1.0
-"""Squared distance in standard deviations between the prediction of the true cause and the best of
-another one, without noise, from which on and up to which they can and cannot be told apart: of two
-known predictions at the first 1.3 % would be taken for the other one, at the second 31 %."""
+"""Squared distance, in standard deviations and without noise, of the true cause's prediction from
+the best other one, from which on and up to which they can and cannot be told apart: of two known
+predictions 1.3 % and 31 % would be taken for the other one."""
 
 
 def scene(rng):
@@ -33,7 +33,7 @@ def scene(rng):
     yaw = rng.uniform(-50, 50, n)
     off = np.stack([0 * yaw, 2 * (yaw - np.degrees(bearing[:, 0]))], axis=-1)
     return Observations(
-        truth, True, known, np.column_stack([truth if known else truth * np.nan, straight]),
+        truth, True, np.column_stack([truth if known else truth * np.nan, straight]),
         np.tile(np.maximum(0.002, 0.005 * straight), (4, 1)).T, off if known else off * np.nan,
         np.full(n, 4.0), rng.uniform(-1, 1, n) if rng.random() < 0.5 else np.full(n, np.nan),
         Calibration(width, height, f, f, (width - 1) / 2, (height - 1) / 2, (), (), ()), size,
@@ -62,7 +62,7 @@ MISTAKES = {
     "focal_length": lambda rows, rng: rows.said * [1, 1, ratio(rng, [2.0, 0.5, 1.5], 0.4)],
     "units": lambda rows, rng: rows.said * rng.choice([10, 100, 1000, 25.4, 0.3048, 0.1, 0.01]),
     "offset": lambda rows, rng: rows.said - (
-        rng.normal(0, 0.1, 3) if rows.spatial else rng.normal(0, 0.1) * sight(rows)),
+        rng.normal(0, 0.1, 3) if rows.cells[1].min() < 3 else rng.normal(0, 0.1) * sight(rows)),
     "axes": lambda rows, rng: turned(rows.said, rng),
     "half_pixel": lambda rows, rng: rows.said - rng.choice([-1, 1]) * 0.5 * rows.said[:, 2:] * [
         1 / rows.camera.fx_px, 1 / rows.camera.fy_px, 0],

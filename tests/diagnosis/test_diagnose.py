@@ -76,7 +76,7 @@ def test_tilted_markers_corners_in_an_image_of_another_resolution_show_it():
     square = 0.05 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0.0]])
     frame = np.array([[600, 0, 426], [0, 600, 239.5], [0, 0, 1]])
     places = np.array([[0.1, 0.05, 0.6], [-0.3, 0, 1.2], [0.4, 0.2, 1.5], [0, -0.2, 1.9]])
-    corners = [cv2.projectPoints(square, np.array([2.6, 0.3, 0.2]), place, frame, None)[0].ravel()
+    corners = [cv2.projectPoints(square, np.array([2.4, 0.6, 0.3]), place, frame, None)[0].ravel()
                for place in places]
     columns = {**dict(zip(CORNERS, np.transpose(corners), strict=True)),
                "tape_m": np.linalg.norm(places, axis=1)}

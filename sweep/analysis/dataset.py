@@ -861,10 +861,27 @@ def chosen_quantities(names: Iterable[str] | None) -> list[Quantity]:
 P = ParamSpec("P")
 
 
+def require_dataset(name: str, given: object) -> None:
+    """Raise ArgumentError unless what is given as an argument is a dataset."""
+    if not isinstance(given, xr.Dataset):
+        raise ArgumentError(
+            name, type(given).__name__, "expected a dataset, as sweep.open returns it")
+
+
 def describes(analysis: Callable[P, xr.Dataset]) -> Callable[P, xr.Dataset]:
-    """Return an analysis whose result has short names."""
+    """Return an analysis that refuses other things than datasets; its result has short names.
+
+    Examples
+    --------
+    >>> describes(axes_of)("runs/smoke.zarr")
+    Traceback (most recent call last):
+    sweep.errors.ArgumentError: results = str: expected a dataset, as sweep.open returns it
+    """
     @functools.wraps(analysis)
     def described(*args: P.args, **kwargs: P.kwargs) -> xr.Dataset:
+        for (name, kind), given in zip(analysis.__annotations__.items(), args, strict=False):
+            if kind == "xr.Dataset":
+                require_dataset(name, given)
         return with_descriptions(analysis(*args, **kwargs))
 
     return described
@@ -915,11 +932,7 @@ def decode_flags(results: Labelled) -> Labelled:
     """
     if isinstance(results, xr.DataArray):
         return _decoded(results)
-    if not isinstance(results, xr.Dataset):
-        raise ArgumentError(
-            "results", type(results).__name__,
-            "expected a dataset, as sweep.open returns it, or a variable of one",
-        )
+    require_dataset("results", results)
     return results.assign({  # without its coordinates, which the results have
         name: _decoded(variable).variable for name, variable in results.data_vars.items()
     })
@@ -939,6 +952,5 @@ def _decoded(variable: xr.DataArray) -> xr.DataArray:
         return labels[np.where(values[at] == flags, at, -1)]
 
     words: xr.DataArray = xr.apply_ufunc(
-        look_up, variable, dask="parallelized", output_dtypes=[labels.dtype])
-    words.attrs = attributes
-    return words
+        look_up, variable, dask="parallelized", output_dtypes=[labels.dtype], keep_attrs=False)
+    return words.assign_attrs(attributes)

@@ -324,10 +324,6 @@ class Condition:
         """Return values as the model is linear in them."""
         return np.asarray(np.log(values) if self.logarithmic else values, dtype=np.float64)
 
-    def unscaled(self, values: Floats) -> Floats:
-        """Return the values that were scaled."""
-        return np.exp(values) if self.logarithmic else values
-
     def varies(self, values: Floats) -> bool:
         """Return whether the last of the sorted values is another than the first."""
         return bool(values[-1] - values[0] > self.tolerance)
@@ -720,7 +716,7 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         for coordinate, dim, values, words in (
                 (name, name, at, "knots"), (f"{cell}_low", cell, edges[:-1], "low end of cells"),
                 (f"{cell}_high", cell, edges[1:], "high end of cells")):
-            coordinates[coordinate] = dim, condition.unscaled(values), {
+            coordinates[coordinate] = dim, np.exp(values) if condition.logarithmic else values, {
                 "units": condition.units, "long_name": f"{words} of {condition.words}"}
     return xr.Dataset(variables, coordinates, attrs={
         "focal_size_px_m": float(focal_size.mean()),

@@ -665,7 +665,7 @@ def efficiency(
     """
     if "bound_std" not in results:
         results = results.assign(bound_std=xr.DataArray(
-            np.nan, {"pose_parameter": list(POSE_PARAMETERS)}, "pose_parameter"))
+            np.nan, {"pose_parameter": list(POSE_PARAMETERS)}, ["pose_parameter"]))
     return _table(results, per, bins, RATIOS)
 
 

@@ -130,6 +130,7 @@ def test_a_column_that_cannot_be_sorted_at_once_is_told_how_to_divide(mixed, mon
 
 def test_efficiency_is_that_of_plain_loops(mixed):
     per = ["distance_m", "solver"]
+    assert efficiency(mixed.drop_vars("bound_std")).isnull().to_array().all()
     answer = efficiency(mixed, per)
     for index, found in poses(mixed, "estimate", per).items():
         chosen = found.where(is_unflipped(found) & ~np.isnan(found["bound_std"]).any(axis=1))

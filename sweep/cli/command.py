@@ -7,6 +7,7 @@ import contextlib
 import errno
 import inspect
 import io
+import json
 import logging
 import os
 import re
@@ -343,7 +344,8 @@ def summarised(
         + (" and --retry-failed what failed" if summary.failures and "retry_failed" in SESSION.flags
            else "")]
     return findings(
-        [*notes, *again, line, f'xarray.open_zarr("{summary.data}")', *summary.warnings],
+        [*notes, *again, line, f"xarray.open_zarr({json.dumps(summary.data, ensure_ascii=False)})",
+         *summary.warnings],
         vars(summary) | numbers, int(summary.nothing_computed),
         then or summary.advice or f"sweep report {quoted(summary.store)}")
 

@@ -22,7 +22,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import NO_TRIALS, search_settings
 from sweep.isolation.child_process import Child, ChildError, Interrupts
-from sweep.messages import notice
+from sweep.messages import notice, quoted
 from sweep.sampling.rules import make_rule
 from sweep.store import blocks, lifecycle
 from sweep.store.blocks import RunStore
@@ -198,7 +198,7 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
         advice = "choose another store, or overwrite it"
         with contextlib.suppress(errors.StoreError):
             if match(pipeline, store).done:
-                advice = "its cells can be reused: give another store, and this one as reuse"
+                advice = f"`sweep run PIPELINE --store NEW --reuse {quoted(url)}` reuses its cells"
         raise errors.StoreError("\n  ".join([f"{url}: holds another experiment; {advice}", *lines]))
     return store
 

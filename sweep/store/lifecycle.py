@@ -688,8 +688,8 @@ def read_pipeline(
         if not names_store(url):
             return Pipeline.from_toml(url, settings)
         if "://" not in url and not (Path(url) / "zarr.json").exists():
-            raise refusal([
-                f"{plain(url)}: a folder that is no store; expected a TOML file or a store"])
+            name = plain(url) or repr(url)
+            raise refusal([f"{name}: a folder that is no store; expected a TOML file or a store"])
         source = open_store(url).pipeline
     return Pipeline.from_text(
         source.text, settings, name=source.name, source=source.source, folder=source.folder)

@@ -57,7 +57,7 @@ def folder(stores, monkeypatch):
         ("tradeoff runs/small.zarr --criterion rotation_p95", "did you mean rotation_p95_deg?"),
         ("run small.toml --retry-failed --reuse runs/small.zarr", "expected no retry_failed"),
         ("run small.toml --set trial=5",
-         "runs/small.zarr: holds another experiment; its cells can be reused: give another store"),
+         "runs/small.zarr: holds another experiment; `sweep run PIPELINE --store NEW --reuse "),
         ("tradeoff runs/small.zarr --seconds nan",
          "--seconds nan: expected a finite number above 0"),
         ("run few.toml --precision 'detection_rate = 0.1'",

@@ -9,17 +9,19 @@ import contextlib
 import importlib
 import io
 import json
-import os
-import subprocess
+import multiprocessing
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from tests.evidence import circumstances
-
 HERE = Path(__file__).parent
 TOP = HERE.parents[1]
+sys.path[:0] = [str(TOP / "tests"), str(TOP)]
+
+from support.here import calls_here  # noqa: E402  (found by the path above)
+from tests.evidence import circumstances  # noqa: E402
+
 HISTORY = HERE / "history.jsonl"
 NAMES = (
     "analysis", "detectors", "engine", "kernel", "renderers", "scale", "size", "stopping",
@@ -29,12 +31,12 @@ NAMES = (
 
 
 def run(name: str, arguments: list[str], quick: bool) -> None:
-    """Run a benchmark in this process; with its constants ``QUICK`` if that is wanted."""
-    sys.path[:0] = [str(TOP / "tests"), str(TOP)]
+    """Run a benchmark; if that is wanted, with its ``QUICK`` and without others' processes."""
     module = importlib.import_module(f"benchmarks.bench_{name}")
     if quick:
         vars(module).update(module.QUICK)
-        sys.exit(module.main(*arguments))
+        with contextlib.nullcontext() if name == "engine" else calls_here():
+            sys.exit(module.main(*arguments))
     printed = Printed()
     with contextlib.redirect_stdout(printed):
         status = module.main(*arguments)
@@ -55,20 +57,19 @@ class Printed(io.StringIO):
 
 
 def run_all() -> int:
-    """Run every benchmark at its smallest size; return how many failed."""
+    """Run every benchmark at its smallest size in a fork of this process; return failures."""
+    for common in ("distributed", "sweep.execution.runner", "sweep.report.write_report"):
+        importlib.import_module(common)  # once for all
     failed, begun = 0, time.perf_counter()
-    for name in NAMES:
-        start = time.perf_counter()
-        with tempfile.TemporaryDirectory() as folder:  # some leave their stores
-            ran = subprocess.run(
-                [sys.executable, "-m", "tests.benchmarks", name, "--quick"], cwd=folder,
-                env={**os.environ, "PYTHONPATH": str(TOP)}, check=False, stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT, text=True)
-        failed += ran.returncode != 0
-        print(f"{name}: exit status {ran.returncode}, {time.perf_counter() - start:.1f} s",
-              flush=True)
-        if ran.returncode:
-            print(ran.stdout)
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # for their stores
+        for name in NAMES:
+            start = time.perf_counter()
+            ran = multiprocessing.get_context("fork").Process(target=run, args=(name, [], True))
+            ran.start()
+            ran.join()
+            failed += ran.exitcode != 0
+            print(f"{name}: exit status {ran.exitcode}, {time.perf_counter() - start:.1f} s",
+                  flush=True)
     print(f"{failed} failed, {time.perf_counter() - begun:.0f} s in all")
     return failed
 

@@ -60,7 +60,7 @@ CALLS = {
     "requirement_limits": "requirement_limits(results, ['detection >= 0.9'], 'side_px')",
 }
 
-QUICK = {"POSES": 10**4, "CALLS": dict(list(CALLS.items())[:2])}
+QUICK = {"POSES": 10**4, "CALLS": dict(list(CALLS.items())[1:2])}
 
 CHILD = """
 import json, sys, time

@@ -32,8 +32,8 @@ PLANE = [0, 2, 4]
 """Errors of a robot's pose: x to the right, z ahead, rotation about the vertical."""
 
 QUICK = {
-    "REFINEMENTS": ("subpix",),
-    "SETTINGS": ('cornerRefinementMethod=["subpix"]', "trial=180"),
+    "REFINEMENTS": ("subpix",), "SETTINGS": (
+        'cornerRefinementMethod=["subpix"]', "distance_m=[3, 5]", "trial=2100", 'window="auto"'),
 }
 
 

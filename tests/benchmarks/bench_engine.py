@@ -48,7 +48,7 @@ solver = ["ippe_square", "ippe", "iterative", "sqpnp", "p3p"]
 MARKERS, DISTANCES = 10, 20
 REPEATS = 3
 SECONDS = 60.0
-QUICK = {"SECONDS": 1.0, "MARKERS": 1, "DISTANCES": 3, "REPEATS": 1}
+QUICK = {"SECONDS": 0.5, "MARKERS": 1, "DISTANCES": 3, "REPEATS": 1}
 
 
 def grid(trials):

@@ -74,10 +74,9 @@ def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
 
 def test_tilted_markers_corners_in_an_image_of_another_resolution_show_it():
     square = 0.05 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0.0]])
-    frame = np.array([[600, 0, 426], [0, 600, 239.5], [0, 0, 1]])
+    turn, frame = np.array([2.4, 0.6, 0.3]), np.array([[600, 0, 426], [0, 600, 239.5], [0, 0, 1]])
     places = np.array([[0.1, 0.05, 0.6], [-0.3, 0, 1.2], [0.4, 0.2, 1.5], [0, -0.2, 1.9]])
-    corners = [cv2.projectPoints(square, np.array([2.4, 0.6, 0.3]), place, frame, None)[0].ravel()
-               for place in places]
+    corners = [cv2.projectPoints(square, turn, place, frame, None)[0].ravel() for place in places]
     columns = {**dict(zip(CORNERS, np.transpose(corners), strict=True)),
                "tape_m": np.linalg.norm(places, axis=1)}
     found = sweep.diagnose(columns, camera=CAMERA, size_m=0.1, dictionary="DICT_5X5_50").numbers

@@ -152,7 +152,7 @@ def close(store: RunStore) -> None:
     """
     blocks.check_not_replaced(store)
     totals, costs = Totals(), {}
-    for number, receipt in blocks.receipts(store, blocks.check_whole(store, finished=True)):
+    for number, receipt in blocks.receipts(store, range(len(store.blocks))):
         totals.add(receipt)
         if any(receipt.seconds["scene"]):
             costs[number] = receipt.seconds

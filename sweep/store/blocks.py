@@ -10,6 +10,7 @@ import json
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -428,7 +429,6 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
     A copy that was made while the store was written has such blocks, for instance.
     """
     missing: dict[int, str] = {}
-    whole: dict[str, list[str]] = {}
     some = list(numbers)
     # All indices at once; one more than there are axes, for a store of one block without any.
     indices = np.unravel_index(np.array(some, np.intp), (*store.blocks.counts, 1))
@@ -440,19 +440,36 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
 
     for variable, (template, _) in store.chunks.items() if some else ():
         names, listed = numbered(template), files.list_folder(store.storage, variable)
-        if listed == whole.get(template):  # many file systems list the same names in one order
-            continue
         absent = {f"{variable}/{name}": names[name] for name in names.keys() - listed}
-        if not absent:
-            whole[template] = listed
         # A listing may be older than a file, as over NFS: what it lacks is looked for.
         found = zip(absent.items(), files.read_files(store.storage, [*absent]), strict=True)
         missing |= {number: key for (key, number), content in found if content is None}
     return missing
 
 
-def check_whole(store: RunStore, *, finished: bool | None = None) -> set[int]:
+def folder_states(store: RunStore) -> dict[str, list[int]]:
+    """Return what tells whether the folders of a local store have the names that they had.
+
+    Returns
+    -------
+    Of each folder of chunks its inode, and when a name in it was last made or deleted, in ns since
+    1970, which POSIX has a file system keep: a folder of the same state has the same names. A copy
+    has other states. Empty on an object store, and if a chunk is newer than its folder: that file
+    system, such as one that shows an object store, does not keep the time.
+    """
+    root, variable = Path(store.url), next(iter(store.chunks))
+    with contextlib.suppress(OSError):  # no URL is a path
+        found = {name: (root / name).stat() for name in (*store.chunks, files.RECEIPTS)}
+        chunk = (root / store.chunk_key(variable, len(store.blocks) - 1)).stat()
+        if found[variable].st_ctime_ns >= chunk.st_mtime_ns:
+            return {name: [each.st_ino, each.st_ctime_ns] for name, each in found.items()}
+    return {}
+
+
+def check_whole(store: RunStore) -> set[int]:
     """Return the committed blocks, of which all chunks are there; of a finished store, all blocks.
+
+    Folders that have not changed since the store was finished are not listed again.
 
     Raises
     ------
@@ -460,16 +477,15 @@ def check_whole(store: RunStore, *, finished: bool | None = None) -> set[int]:
         If receipts of a finished store, or chunks of committed blocks, are missing.
     """
     # Asked first: the last blocks may be written, and the store closed, after blocks are listed.
-    finished = store.finished if finished is None else finished
-    for _ in range(3):
-        listed = committed(store)
-        missing = missing_chunks(store, listed)
+    metadata = store.run_metadata
+    if (states := folder_states(store)) and states == metadata.get("folders"):
+        return set(range(len(store.blocks)))
+    done = committed(store)
+    if missing := missing_chunks(store, done):
         # A writer may have begun to compute a block again in between, and even committed it.
-        done = listed & committed(store) if missing else listed
-        missing = {number: key for number, key in missing.items() if number in done}
-        if not missing:
-            break
-    if finished:
+        done &= committed(store)
+        missing = missing_chunks(store, done & missing.keys())
+    if metadata["finished"]:
         missing |= {number: receipt_key(number) for number in range(len(store.blocks))
                     if number not in done}
     if not missing:

@@ -543,7 +543,7 @@ def reopen(
         check_same_rule(store)
         metadata = store.run_metadata | ({} if pipeline is None else _recorded(pipeline)) | {
             "finished": False, "files": checksums(contents)}
-        for ended in ("finished_at", "counts"):
+        for ended in ("finished_at", "counts", "folders"):
             metadata.pop(ended, None)
         files.write_files(store.storage, contents)
         write_root(store, metadata, pipeline)
@@ -586,17 +586,19 @@ def write_groups(
     contents = {key: content for key, content in files.files_in(memory).items()
                 if key.startswith(within)}
     metadata = store.run_metadata
-    if counts is not None:
-        metadata |= {"finished": True, "finished_at": utc_now(), "counts": counts}
-    listed = metadata["files"]
-    others = {key: crc for key, crc in listed.items()
-              if counts is not None or not key.startswith(within)}
     with locations.translate_errors(store.url, "written"):
+        if counts is not None:
+            files.delete_folder(store.storage, blocks.BEGUN)
+            metadata |= {"finished": True, "finished_at": utc_now(), "counts": counts,
+                         "folders": blocks.folder_states(store)}
+            blocks.check_whole(store)  # after their states: they may change between the two
+        listed = metadata["files"]
+        others = {key: crc for key, crc in listed.items()
+                  if counts is not None or not key.startswith(within)}
         if len(others) < len(listed):
             write_root(store, {**metadata, "files": others})
             for name in groups:
                 files.delete_folder(store.storage, name)
-        files.delete_folder(store.storage, blocks.BEGUN)
         files.write_files(store.storage, contents)
         write_root(store, {**metadata, "files": others | checksums(contents)})
 

@@ -199,10 +199,8 @@ def _similar(url: str) -> str:
 def enclosing_store(path: Path) -> Path | None:
     """Return the outermost store that a local path is, or lies in; None if there is none."""
     resolved = Path(os.path.realpath(path))
-    for folder in (*reversed(resolved.parents), resolved):
-        if (folder / "zarr.json").is_file():
-            return folder
-    return None
+    folders = (*reversed(resolved.parents), resolved)
+    return next((folder for folder in folders if (folder / "zarr.json").is_file()), None)
 
 
 def check_writable(url: str) -> None:

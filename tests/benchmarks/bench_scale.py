@@ -33,10 +33,10 @@ from sweep.execution import on_cluster
 from sweep.execution import status as execution_status
 from sweep.execution.forecast import block_work_s
 from sweep.execution.runner import compute
-from sweep.execution.status import status
+from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import SINGLE_THREADED, Interrupts
-from sweep.store.blocks import Receipt, check_whole, committed, receipt_key, receipts
+from sweep.store.blocks import Receipt, check_whole, receipt_key, receipts
 from sweep.store.files import write_files
 from sweep.store.lifecycle import create_store, open_store
 
@@ -157,7 +157,7 @@ def simulated(count, waves, folder):
 
 
 def stored(count, folder):
-    """Return processor seconds that a store of ``count`` blocks takes to list, count and open."""
+    """Return processor seconds that ``count`` blocks take to be continued, closed and opened."""
     store = created(count, f"{folder}/stored.zarr")
     home = Path(store.url)
     for number in range(len(store.blocks)):
@@ -168,10 +168,9 @@ def stored(count, folder):
             (home / store.chunk_key(variable.name, number)).hardlink_to(chunk)
         (home / receipt_key(number)).write_bytes(receipt_of(store, number, 2.0).to_bytes())
     calls = {
-        "open_store": lambda: open_store(store.url),
-        "committed": lambda: committed(store),
         "continue": lambda: sum(1 for _ in receipts(store, check_whole(store))),
         "status": lambda: status(store.url),
+        "close": lambda: close(store),
         "sweep.open": lambda: sweep.open(store.url),
     }
     figures = {"blocks": len(store.blocks)}

@@ -116,7 +116,7 @@ def test_reader_between_any_two_writes_of_a_block_sees_no_flag_without_its_numbe
     assert (solved[0], solved[-1]) == ((4, 8) if work == "write" else (4, 0))
 
 
-def test_opened_store_shows_the_blocks_that_were_committed_when_it_was_opened(pipeline, tmp_path):
+def test_opened_store_shows_the_blocks_committed_until_then(pipeline, tmp_path, monkeypatch):
     url = str(tmp_path / "read.zarr")
     store = by_hand(url, pipeline, (2,), [0])
     # A process that was killed in the midst of a block left a chunk of it.
@@ -131,6 +131,10 @@ def test_opened_store_shows_the_blocks_that_were_committed_when_it_was_opened(pi
     close(open_store(url, "r+"))
     with sweep.open(url) as results:
         assert (results.estimate == 1).all()
+    monkeypatch.setattr("sweep.store.files.list_folder", lambda *_: [])
+    assert check_whole(open_store(url)) == {0, 1}  # no folder has changed since: none is listed
+    with pytest.raises(StoreError, match="2 of 2 blocks lack"):  # those of a copy are
+        check_whole(open_store(str(shutil.copytree(url, tmp_path / "copy.zarr"))))
 
 
 def test_copy_that_was_made_during_a_run_is_continued_to_the_same_store(
@@ -201,9 +205,7 @@ def test_readers_name_a_coordinate_that_was_rewritten(name, values, copied, caps
     assert name in {damage.where.partition("/")[0] for damage in verify(str(copied), 0).damage}
 
 
-def test_reused_cells_keep_the_processor_that_computed_them(
-    grid, tmp_path, monkeypatch, capsys
-):
+def test_reused_cells_keep_the_processor_that_computed_them(grid, tmp_path, monkeypatch, capsys):
     old, url = str(tmp_path / "old.zarr"), str(tmp_path / "grown.zarr")
     with monkeypatch.context() as patch:
         patch.setattr("sweep.execution.block_task.processor", lambda: "elsewhere")

@@ -147,10 +147,10 @@ def field_of(sums: Floats, shares: Floats, lengths_px: Floats) -> Field:
         limit = float(special.stdtrit(len(sums) - 2, 1 - TAIL)) ** 2
         ends = [_ends(np.sqrt(variances), misfit.min(axis=1) <= limit),
                 _ends(lengths_px, misfit.min(axis=0) <= limit)]
-    return Field(
-        Estimate(size, *ends[0]), Estimate(math.exp(length), *ends[1]),
-        estimate(sums.sum(axis=1) / total.mean()),
-    )
+    # The sums of all photographs, in which the largest weigh most, may lead beyond an interval.
+    held = [Estimate(float(np.fmin(np.fmax(value, low), high)), low, high)
+            for value, (low, high) in zip((size, math.exp(length)), ends, strict=True)]
+    return Field(held[0], held[1], estimate(sums.sum(axis=1) / total.mean()))
 
 
 def _misfit(sums: Floats, shares: Floats, variances: Floats) -> Floats:

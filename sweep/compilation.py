@@ -42,7 +42,9 @@ def compiled(function: Function, *, forceinline: bool = False, packed: bool = Fa
     # Compilation may be switched off (AttributeError); where no folder can be written to
     # (RuntimeError), each process compiles for itself.
     with contextlib.suppress(AttributeError, RuntimeError):
-        dispatcher.compile = partial(_compile, packed, dispatcher, dispatcher.compile)
+        # One thread at a time, as in Numba: it changes Numba's configuration.
+        alone = untyped_numba.core.compiler_lock.global_compiler_lock(_compile)
+        dispatcher.compile = partial(alone, packed, dispatcher, dispatcher.compile)
         dispatcher.enable_caching()
         # Numba compares a function's own file only. It would go on using code in which a function
         # of another file is inlined as that was.

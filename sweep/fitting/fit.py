@@ -768,9 +768,7 @@ def held_out(pipeline: Pipeline, numbers: Integers, folder: Path) -> Pipeline:
     return Pipeline.from_dict(document, name=name, source="held out", folder=folder)
 
 
-def checked(
-    found: SceneFit, pipeline: Pipeline, home: Path
-) -> tuple[SceneFit, xr.Dataset]:
+def checked(found: SceneFit, pipeline: Pipeline, home: Path) -> tuple[SceneFit, xr.Dataset]:
     """Return the scene with what moves errors of held-out photographs, and the gap that is left.
 
     Every other photograph is held out, and the scene of the others simulated; stores go to

@@ -502,9 +502,8 @@ def fit_photograph(
             fitted_state(each.marker, np.concatenate([each.parameters[:OWN], shared]), own)
             for each in states
         ]
-    result = shared.copy()
-    result[moved] += _shared_step(states, moved)
-    return PhotographFit(result, tuple(states), *flat_pixels(states))
+    shared[moved] += _shared_step(states, moved)
+    return PhotographFit(shared, tuple(states), *flat_pixels(states))
 
 
 def _shared_step(states: Sequence[MarkerState], moved: Masks) -> Floats:

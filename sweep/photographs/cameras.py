@@ -174,9 +174,7 @@ def fitted_board(camera: Calibration, found: FoundCorners) -> FittedPose | None:
         for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_IPPE) for start in guard.poses(method)
     ]
     good = [fit for fit in fits if fit is not None and fit.used.sum() >= MIN_CORNERS]
-    return min(
-        good, key=lambda fit: float(np.median((fit.residuals**2).sum(axis=1))), default=None
-    )
+    return min(good, key=lambda fit: float(np.median((fit.residuals**2).sum(axis=1))), default=None)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -370,9 +368,7 @@ MIN_CALIBRATING = 12
 MAX_RMS_PX = 2.0
 
 
-def calibrate(
-    size: tuple[int, int], found: Sequence[FoundCorners]
-) -> tuple[Calibration, str]:
+def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> tuple[Calibration, str]:
     """Return a camera with five coefficients, and a line (:mod:`sweep.measure.intrinsics`).
 
     Parameters

@@ -152,19 +152,25 @@ class SeenMarkers(NamedTuple):
         return place[place >= 0].astype(np.int64), self.quads[place >= 0]
 
 
-def reference_detector() -> FindFunction:
+#: Settings of a detector that finds markers of little contrast, and more that are none.
+FAINT = {"adaptiveThreshConstant": 1.0, "minOtsuStdDev": 1.0}
+
+
+def reference_detector(**settings: Any) -> FindFunction:
     """Return the detector that finds boards: whatever is under test, truth is the same."""
-    return make_detector(DetectorSetting(cornerRefinementMethod="subpix"))
+    return make_detector(DetectorSetting(cornerRefinementMethod="subpix", **settings))
 
 
 def detect_markers(
-    find: FindFunction, image: NDArray[np.uint8], dictionary: str
+    find: FindFunction, image: NDArray[np.uint8], dictionary: str, faint: FindFunction | None = None
 ) -> SeenMarkers:
     """Return the markers of a dictionary in an image; those of an ID that is there twice are not.
 
-    ``find`` is a detector's search.
+    ``find`` is a detector's search, and ``faint`` another's where the first finds nothing.
     """
     quads, ids, _ = find(image, dictionary, max(image.shape))
+    if faint and not len(quads):
+        quads, ids, _ = faint(image, dictionary, max(image.shape))
     numbers = np.array([] if ids is None else ids, dtype=np.int64).ravel()
     once = ~pd.Series(numbers).duplicated(keep=False).to_numpy()
     repeated = len(np.unique(numbers[~once]))

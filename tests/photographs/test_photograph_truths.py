@@ -201,10 +201,8 @@ def test_a_fault_is_one_line(faulty, tmp_path, name, options, expected):
     given = {"camera": "camera.json", "board": {}, **options}
     board = tmp_path / "board.toml"
     board.write_text(toml(**given.pop("board")))
-    paths = {
-        key: faulty / value if isinstance(value, str) and "." in value else value
-        for key, value in given.items()
-    }
+    paths = {key: faulty / value if isinstance(value, str) and "." in value else value
+             for key, value in given.items()}
     with pytest.raises(SweepError, match=expected) as caught:
         prepare([faulty / name], paths.pop("camera"), board=board, home=tmp_path, **paths)
     assert "\n" not in str(caught.value)
@@ -218,6 +216,7 @@ def test_what_is_left_out_and_converted_is_said(faulty, tmp_path):
     cv2.imwrite(str(shots / "deep.png"), grey.astype(np.uint16) * 257)
     cv2.imwrite(str(shots / "colour.png"), cv2.merge([grey, grey // 2, grey]))
     cv2.imwrite(str(shots / "blurred.png"), cv2.GaussianBlur(grey, (0, 0), 9))
+    cv2.imwrite(str(shots / "faint.png"), (100 + 0.08 * grey).astype(np.uint8))  # it has a pose
     (shots / "cut.jpg").write_bytes(b"\xff\xd8\xff")
     for name in (os.fsdecode(b"\xff.png"), "again.png"):
         shutil.copy(shots / "deep.png", shots / name)

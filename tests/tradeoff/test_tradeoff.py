@@ -170,7 +170,7 @@ def test_cheaper_images_differ_from_exact_ones_and_exact_ones_do_not(tmp_path):
 def test_bad_arguments_are_told_in_one_line_before_anything_is_measured(
     arguments, message, store, monkeypatch
 ):
-    monkeypatch.setattr(tradeoff, "measure_trade", pytest.fail)
+    monkeypatch.setattr(tradeoff, "_trade", pytest.fail)
     code, out, err = command("tradeoff", store, *arguments)
     assert (code, out, message in err) == (2, "", True)
     assert err.count("\n") == 1

@@ -230,7 +230,7 @@ def test_what_comes_behind_the_camera_is_not_modelled_in_the_board_s_plane(besid
     chosen = distracted({**SQUARES, "distractors": beside}, pose={"tilt_deg": tilt})
     values = chosen.experiment.scene_values([])
     scenes = build_scenes(values, 1)
-    flags = visibility_flags(scenes)
+    flags = visibility_flags(scenes, 0)
     assert flags[0] == expected
     boards = target_scenes(
         scenes, flags, values["board"].listed(1), chosen.largest_board)

@@ -42,7 +42,7 @@ def visible_scenes(count, width=640, height=480, settings=()):
             pipeline.experiment.scene_values(block.indices(cells)), len(cells))
 
     candidates = order[: count * 5 // 4 + 20]
-    seen = np.flatnonzero(visibility_flags(built(candidates)) == DetectionStatus.not_run)
+    seen = np.flatnonzero(visibility_flags(built(candidates), 0) == DetectionStatus.not_run)
     assert len(seen) >= count
     return built(candidates[seen[:count]])
 

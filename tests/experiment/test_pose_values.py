@@ -162,7 +162,7 @@ def test_any_pose_has_a_truth_and_is_the_same_alone(count):
         indices, scene_count = whole(pipeline).indices(), len(whole(pipeline))
         values = pipeline.experiment.scene_values(indices)
         scenes = build_scenes(values, scene_count)
-        unseen = visibility_flags(scenes) == DetectionStatus.not_visible
+        unseen = visibility_flags(scenes, 0) == DetectionStatus.not_visible
         for name, function in GEOMETRY.items():
             numbers = function(scenes)
             if name == "marker_area_px":

@@ -145,7 +145,7 @@ def drawn(count, seed, sides=(8, 150), max_tilt=80, **given):
         if not visible(value):
             continue
         scenes = build_scenes(value, 1)
-        if visibility_flags(scenes)[0] == DetectionStatus.not_run:
+        if visibility_flags(scenes, 0)[0] == DetectionStatus.not_run:
             found.append(value)
     return found
 

@@ -104,7 +104,7 @@ def test_lens_is_inverted_to_the_end_where_opencv_stops_early(count, lens):
         },
     })
     scenes = build_scenes(pipeline.experiment.scene_values(whole(pipeline).indices()), count)
-    seen = visibility_flags(scenes) == DetectionStatus.not_run
+    seen = visibility_flags(scenes, 0) == DetectionStatus.not_run
     for solver, guarded in itertools.product(RELIABLE, (True, False)):
         found = estimate(
             scenes.corners_px, scenes.cameras, scenes.size_m, solver, guarded, 0.25)

@@ -303,7 +303,7 @@ def test_extent_of_points_over_a_plane_is_that_of_their_projections():
 def test_motion_that_has_no_image_is_not_modelled(given):
     scenes = build_scenes(scene(background=100.0, **given), 1)
     assert not_modelled(scenes)[0]
-    assert visibility_flags(scenes).tolist() == [DetectionStatus.not_modelled]
+    assert visibility_flags(scenes, 0).tolist() == [DetectionStatus.not_modelled]
     slow = build_scenes(scene(velocity_z_m_s=-0.1, exposure_s=1.0), 1)
     assert not not_modelled(slow)[0]
 

@@ -157,6 +157,6 @@ def test_markers_behind_other_sheets_and_from_behind_are_not_visible(board, seen
     chosen = pipeline([], tilt_deg=0.0, board=board)
     scenes, values = scenes_of(chosen), chosen.experiment.scene_values([])
     size = len(seen), 0
-    boards = target_scenes(scenes, visibility_flags(scenes), values["board"].listed(1), size)
+    boards = target_scenes(scenes, visibility_flags(scenes, 0), values["board"].listed(1), size)
     assert (boards.flags[0] == DetectionStatus.not_run).tolist() == seen
     assert (boards.flags[0] == DetectionStatus.not_visible).tolist() == np.invert(seen).tolist()

@@ -447,6 +447,11 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
     return missing
 
 
+#: Blocks from which folders are known by their times. Fewer are quick to list, and may be written
+#: within a second: whether a file system with so coarse times changes those of folders is not seen.
+MANY_BLOCKS = 1000
+
+
 def folder_states(store: RunStore) -> dict[str, list[int]]:
     """Return what tells whether the folders of a local store have the names that they had.
 
@@ -454,14 +459,14 @@ def folder_states(store: RunStore) -> dict[str, list[int]]:
     -------
     Of each folder of chunks its inode, and when a name in it was last made or deleted, in ns since
     1970, which POSIX has a file system keep: a folder of the same state has the same names. A copy
-    has other states. Empty on an object store, and if a chunk is newer than its folder: that file
-    system, such as one that shows an object store, does not keep the time.
+    has other states. Empty of few blocks, on an object store, and if a chunk is newer than its
+    folder: that file system, such as one that shows an object store, does not keep the time.
     """
     root, variable = Path(store.url), next(iter(store.chunks))
     with contextlib.suppress(OSError):  # no URL is a path
         found = {name: (root / name).stat() for name in (*store.chunks, files.RECEIPTS)}
         chunk = (root / store.chunk_key(variable, len(store.blocks) - 1)).stat()
-        if found[variable].st_ctime_ns >= chunk.st_mtime_ns:
+        if len(store.blocks) >= MANY_BLOCKS and found[variable].st_ctime_ns >= chunk.st_mtime_ns:
             return {name: [each.st_ino, each.st_ctime_ns] for name, each in found.items()}
     return {}
 

@@ -494,9 +494,7 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
     return dataset[ordered]
 
 
-def _only_committed(
-    store: RunStore, dataset: xr.Dataset, done: Collection[int]
-) -> xr.Dataset:
+def _only_committed(store: RunStore, dataset: xr.Dataset, done: Collection[int]) -> xr.Dataset:
     """Return results with fill values in all blocks but those that are ``done``.
 
     A writer may be at any other block meanwhile, or may have been killed in the midst of one.

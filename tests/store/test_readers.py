@@ -118,6 +118,7 @@ def test_reader_between_any_two_writes_of_a_block_sees_no_flag_without_its_numbe
 
 def test_opened_store_shows_the_blocks_committed_until_then(pipeline, tmp_path, monkeypatch):
     url = str(tmp_path / "read.zarr")
+    monkeypatch.setattr("sweep.store.blocks.MANY_BLOCKS", 2)
     store = by_hand(url, pipeline, (2,), [0])
     # A process that was killed in the midst of a block left a chunk of it.
     editable(url, "estimate")[2:] = np.ones((2, 2), dtype=np.uint8)

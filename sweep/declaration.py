@@ -50,11 +50,13 @@ class Declared:
         """Return the allowed values in words, as error messages and the reference print them."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
-        above = f"{'above' if self.open_low else 'at least'} {self.low:g}"
-        below = f"at most {self.high:g}"
+        # Whole bounds with all their digits: 2**63 - 1 is no round number.
+        low, high = (f"{each:{'d' if isinstance(each, int) else 'g'}}"
+                     for each in (self.low, self.high))
+        above = f"{'above' if self.open_low else 'at least'} {low}"
         if math.isinf(self.low) or math.isinf(self.high):
-            return above * math.isfinite(self.low) + below * math.isfinite(self.high)
-        return f"{above} and {below}" if self.open_low else f"from {self.low:g} to {self.high:g}"
+            return above * math.isfinite(self.low) + f"at most {high}" * math.isfinite(self.high)
+        return f"{above} and at most {high}" if self.open_low else f"from {low} to {high}"
 
     def choice(self, word: str) -> str | None:
         """Return the choice that a word names, however OpenCV or the user spells it, or None.
@@ -90,7 +92,8 @@ class Declared:
             return self.list_text or (
                 f"a list of {', '.join(map(str, counts))} or {last} finite numbers below 1e300")
         words = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
-        kind = "" if self.choices else " or ".join(words[kind] for kind in self.types)
+        # A number last: the range behind it is its own.
+        kind = "" if self.choices else " or ".join(words[kind] for kind in reversed(self.types))
         return f"{kind} {self.range_text()}".strip()
 
     def check(self, value: Any) -> Any:
@@ -99,15 +102,14 @@ class Declared:
             return self.reads(value)
         found: Any = None
         match value:
-            case bool():
-                found = value if bool in self.types else None
             case str() if str in self.types:
                 found = self.choice(value) if self.choices else value or None
             case list() | tuple() if len(value) in self.lengths and all(map(_is_number, value)):
                 found = tuple(map(float, value))
-            case int() if int in self.types and self.admits(value):
+            case int() if type(value) in self.types and self.admits(value):  # a bool is an int
                 found = value
-            case int() | float() if float in self.types and self.admits(value):
+            case int() | float() if float in self.types and _is_number(value) and (
+                    self.admits(value)):
                 found = float(value)
         if found is None:
             word = value.removeprefix(self.prefix) if isinstance(value, str) else ""

@@ -122,10 +122,9 @@ def camera_calibrations(
         raise ArgumentError("coefficients", coefficients,
                             f"expected one of {', '.join(map(str, FREE_COEFFICIENTS))}")
     check_positive("target_m", target_m, "expected a distance above 0 m")
-    if points is None:
-        points = "chessboard" if POINTS["chessboard"] in results else "markers"
-    if POINTS.get(points) not in results:
-        there = [name for name, variable in POINTS.items() if variable in results]
+    there = [name for name, variable in POINTS.items() if variable in results]
+    points = next(iter(there), "") if points is None else points
+    if points not in there:
         raise ArgumentError("points", points, f"expected one of {', '.join(there)}")
     trials = results.sizes.get(DRAWS, 1)
     sets = trials // counts[-1]
@@ -194,8 +193,8 @@ def calibration_summary(calibrated: xr.Dataset) -> xr.Dataset:
 
     Raises
     ------
-    KeyError
-        If a variable is missing.
+    DatasetError
+        If they are none.
 
     Notes
     -----
@@ -215,6 +214,8 @@ def calibration_summary(calibrated: xr.Dataset) -> xr.Dataset:
     def squared_mean(values: xr.DataArray) -> xr.DataArray:
         return (values**2).mean("set") ** 0.5
 
+    if "calibration" not in calibrated:
+        raise DatasetError("no variable calibration: expected what camera_calibrations returns")
     solved = calibrated["calibration"] == CalibrationStatus.calibrated
     error, std = (calibrated[name].where(solved) for name in ("intrinsic_error", "intrinsic_std"))
     free, count = (std > 0).any("set"), solved.sum("set")

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from sweep.errors import ArgumentError, StoreError
 from sweep.experiment.document import file_text
-from sweep.messages import nearest, nearest_file, plain, refusal
+from sweep.messages import nearest, plain, refusal
 from sweep.model.pose import rotation_of_vector
 from sweep.plugins.loading import OF_TARGET, REJECTED
 from sweep.typing import Floats, Integers
@@ -227,7 +227,7 @@ def read_answers(
     try:
         text = file_text(path, MAX_BYTES)
     except ValueError as error:
-        raise StoreError(f"{source}: {error}{nearest_file(path)}") from None
+        raise StoreError(f"{source}: {error}") from None
     table = _table(text, source, faults)
 
     def judge(wrong: pd.Series, words: str, **more: pd.Series) -> None:

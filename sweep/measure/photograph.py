@@ -44,9 +44,9 @@ _GAUSS = np.zeros((MOST_NODES + 1, 2, MOST_NODES))
 for _n in range(1, MOST_NODES + 1):
     _GAUSS[_n, :, :_n] = np.polynomial.legendre.leggauss(_n)
 
-#: Distance of an edge's middle from its chord above which it is drawn in pieces: the curve through
-#: three points is within 0.005 px of what a lens makes of such a piece.
-MOST_BEND_PX = 0.1
+#: How far a curve through three points of an edge may be, at a quarter, from what a lens makes of
+#: it; else the edge is drawn in pieces.
+MOST_OFF_PX = 0.005
 
 #: Nodes of a panel, and of each standard deviation of the point spread along it: 3e-4 of the jump.
 END_NODES, NODES_A_DEVIATION = 2.0, 0.85
@@ -225,8 +225,11 @@ def add_plane(
         x, y = polygon.edge_pixel(0.0, edge, projection, flat)
         u, v = polygon.edge_pixel(1.0, edge, projection, flat)
         xm, ym = polygon.edge_pixel(0.5, edge, projection, flat)
-        bend = abs((xm - x) * (v - y) - (ym - y) * (u - x)) / max(math.hypot(u - x, v - y), 1e-9)
-        pieces = min(1 + int(math.sqrt(bend / MOST_BEND_PX)), MAX_PANELS)
+        # How far the curve is off across the edge, at a quarter: a cubic is hardly farther off.
+        xq, yq = polygon.edge_pixel(0.25, edge, projection, flat)
+        xq, yq = xq - 0.375 * x - 0.75 * xm + 0.125 * u, yq - 0.375 * y - 0.75 * ym + 0.125 * v
+        off = abs(xq * (v - y) - yq * (u - x)) / max(math.hypot(u - x, v - y), 1e-9)
+        pieces = min(1 + int((off / MOST_OFF_PX) ** (1.0 / 3.0)), MAX_PANELS)
         for piece in range(pieces):
             if pieces > 1:
                 xm, ym = polygon.edge_pixel((piece + 0.5) / pieces, edge, projection, flat)

@@ -864,7 +864,7 @@ P = ParamSpec("P")
 def require_dataset(name: str, given: object) -> None:
     """Raise ArgumentError unless what is given as an argument is a dataset."""
     if not isinstance(given, xr.Dataset):
-        raise ArgumentError(name, type(given).__name__, "expected what sweep.open returns")
+        raise ArgumentError(name, type(given).__name__, "expected a dataset of sweep.open")
 
 
 def describes(analysis: Callable[P, xr.Dataset]) -> Callable[P, xr.Dataset]:
@@ -874,7 +874,7 @@ def describes(analysis: Callable[P, xr.Dataset]) -> Callable[P, xr.Dataset]:
     --------
     >>> describes(axes_of)("runs/smoke.zarr")
     Traceback (most recent call last):
-    sweep.errors.ArgumentError: results = str: expected what sweep.open returns
+    sweep.errors.ArgumentError: results = str: expected a dataset of sweep.open
     """
     @functools.wraps(analysis)
     def described(*args: P.args, **kwargs: P.kwargs) -> xr.Dataset:

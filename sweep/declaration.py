@@ -102,14 +102,15 @@ class Declared:
             return self.reads(value)
         found: Any = None
         match value:
+            case bool():
+                found = value if bool in self.types else None
             case str() if str in self.types:
                 found = self.choice(value) if self.choices else value or None
             case list() | tuple() if len(value) in self.lengths and all(map(_is_number, value)):
                 found = tuple(map(float, value))
-            case int() if type(value) in self.types and self.admits(value):  # a bool is an int
+            case int() if int in self.types and self.admits(value):
                 found = value
-            case int() | float() if float in self.types and _is_number(value) and (
-                    self.admits(value)):
+            case int() | float() if float in self.types and self.admits(value):
                 found = float(value)
         if found is None:
             word = value.removeprefix(self.prefix) if isinstance(value, str) else ""

@@ -194,7 +194,7 @@ def calibration_summary(calibrated: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     DatasetError
-        If they are none.
+        If the dataset is not one that `camera_calibrations` returns.
 
     Notes
     -----

@@ -103,7 +103,7 @@ class TruthSource(Flag):
     """Origin of the true pose of a marker in a photograph."""
 
     not_run = flag(0, "The pose was not computed.", counted=False)
-    none = flag(1, "There is no truth: errors are differences from a pose by the own corners.")
+    none = flag(1, "No truth: errors are relative to a pose from the marker's own corners.")
     board_without_this_marker = flag(
         2, "The pose of the board, fitted to all its corners except those of this marker.",
         present=True,

@@ -140,8 +140,8 @@ def size_of(each: inference.Explanation, rows: Observations) -> str:
             f"(± {100.0 * spread * sd:.2g} %)" if spread else
             f"{f'{axis} ' * (len(columns) > 1)}{scale * mean:+.2f} ± {scale * sd:.2g} {unit}"
             for axis, _, (mean, sd) in zip("xyz", columns, numbers, strict=False)]
-        if way["label"][0]:
-            sizes.append(" or ".join(dict.fromkeys(filter(None, way["label"]))))
+        if way["label"][0]:  # of a dozen units that fit, the three likeliest are named
+            sizes.append(" or ".join(dict.fromkeys(filter(None, way["label"][:3]))))
         if sizes:
             texts.append(f"{cause.name}: " * (len(each.causes) > 1) + ", ".join(sizes))
     return "; ".join(texts)

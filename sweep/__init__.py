@@ -54,12 +54,11 @@ __all__ = [
 experiment.quantity_faults = lambda texts, names: (  # noqa: PLW0108  (imported when it is used)
     library.requirements.quantity_faults(texts, names))
 
-#: Modules of the library by the public names that are imported from them.
-_IMPORTED_ON_USE = {
-    "Pipeline": "pipeline", "decode_flags": "dataset",
-    "diagnose": "diagnosis", "error_model": "detection", "fit": "fit", "limit": "findings",
-    "measure_tradeoff": "findings", "reference": "reference", "require": "findings",
-    "size": "findings", "write_report": "write_report",
+#: Modules of the library that have public names, but for those of `findings`.
+_HOMES = {
+    "Pipeline": "pipeline", "decode_flags": "dataset", "diagnose": "diagnosis",
+    "error_model": "detection", "fit": "fit", "reference": "reference",
+    "write_report": "write_report",
 }
 
 
@@ -67,9 +66,9 @@ if not TYPE_CHECKING:  # so that mypy knows the names above alone
 
     def __getattr__(name: str) -> Any:
         """Import a public name when it is first used."""
-        if name not in _IMPORTED_ON_USE:
+        if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(getattr(library, _IMPORTED_ON_USE[name]), name)
+        return getattr(getattr(library, _HOMES.get(name, "findings")), name)
 
 
 def __dir__() -> list[str]:

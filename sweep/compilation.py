@@ -18,11 +18,9 @@ from sweep.errors import MachineFaultError, RunError
 from sweep.messages import local_fault
 
 try:
-    import numba
+    numba: Any = importlib.import_module("numba")  # whose types lack options
 except (ValueError, TypeError) as error:  # it reads its configuration while it is imported
     raise RunError(f"Numba cannot be imported with its NUMBA_... variables: {error}") from None
-
-untyped_numba: Any = numba  # whose types lack options
 
 #: Rooms with compiled functions.
 ROOMS = ("model", "measure", "fitting")
@@ -36,14 +34,14 @@ def compiled(function: Function, *, forceinline: bool = False, packed: bool = Fa
     IEEE arithmetic is kept in source order (no ``fastmath``), so that results do not depend on
     how loops were vectorised; the global interpreter lock is released while it runs.
     """
-    dispatcher: Any = untyped_numba.njit(
+    dispatcher: Any = numba.njit(
         function, nogil=True, error_model="numpy", forceinline=forceinline, no_cfunc_wrapper=True
     )
     # Compilation may be switched off (AttributeError); where no folder can be written to
     # (RuntimeError), each process compiles for itself.
     with contextlib.suppress(AttributeError, RuntimeError):
         # One thread at a time, as in Numba: it changes Numba's configuration.
-        alone = untyped_numba.core.compiler_lock.global_compiler_lock(_compile)
+        alone = numba.core.compiler_lock.global_compiler_lock(_compile)
         dispatcher.compile = partial(alone, packed, dispatcher, dispatcher.compile)
         dispatcher.enable_caching()
         # Numba compares a function's own file only. It would go on using code in which a function
@@ -75,7 +73,7 @@ def _compile(packed: bool, dispatcher: Any, compile_signature: Any, signature: A
 
     Constants of a caller count as integers: not once for each constant.
     """
-    config = untyped_numba.config
+    config = numba.config
     before, config.SLP_VECTORIZE = config.SLP_VECTORIZE, packed
     try:
         return compile_signature(tuple(map(numba.types.unliteral, signature)))

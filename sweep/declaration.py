@@ -100,22 +100,21 @@ class Declared:
         """Return ``value`` in the field's type; ValueError(expectation) if not allowed."""
         if self.reads is not None and value not in self.choices:
             return self.reads(value)
-        found: Any = None
         match value:
-            case bool():
-                found = value if bool in self.types else None
-            case str() if str in self.types:
-                found = self.choice(value) if self.choices else value or None
+            case bool():  # it is an int, too
+                if bool in self.types:
+                    return value
+            case str() if str in self.types and (
+                    word := self.choice(value) if self.choices else value):
+                return word
             case list() | tuple() if len(value) in self.lengths and all(map(_is_number, value)):
-                found = tuple(map(float, value))
+                return tuple(map(float, value))
             case int() if int in self.types and self.admits(value):
-                found = value
+                return value
             case int() | float() if float in self.types and self.admits(value):
-                found = float(value)
-        if found is None:
-            word = value.removeprefix(self.prefix) if isinstance(value, str) else ""
-            raise ValueError(f"{self.expected()}{nearest(word, self.choices)}")
-        return found
+                return float(value)
+        word = value.removeprefix(self.prefix) if isinstance(value, str) else ""
+        raise ValueError(f"{self.expected()}{nearest(word, self.choices)}")
 
 
 def _is_number(value: Any) -> bool:

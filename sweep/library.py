@@ -28,11 +28,8 @@ if TYPE_CHECKING:
 if not TYPE_CHECKING:  # so that mypy knows the names above alone
 
     def __getattr__(name: str) -> Any:
-        """Import a module when it is first used; of two of one name, that of the later room."""
-        top = Path(__file__).parent
-        found = sorted((*top.glob(f"{name}.py"), *top.glob(f"*/{name}.py")))
-        if not found:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        where = found[-1].relative_to(top.parent).with_suffix("").parts
-        globals()[name] = importlib.import_module(".".join(where))  # it is found once
-        return globals()[name]
+        """Import a room's module when it is first used."""
+        for path in Path(__file__).parent.glob(f"*/{name}.py"):
+            globals()[name] = importlib.import_module(f"sweep.{path.parent.name}.{name}")
+            return globals()[name]
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -145,18 +145,6 @@ def letters_of(word: str) -> str:
     return re.sub(r"[\W_]", "", word.casefold())
 
 
-def duration(seconds: float) -> str:
-    """Return a time in the largest unit of which there are at least two.
-
-    >>> duration(90.0), duration(150.0), duration(1e6)
-    ('90.0 s', '2.5 min', '11.6 days')
-    """
-    for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * length:
-            return f"{seconds / length:.1f} {unit}"
-    return f"{seconds:.1f} s"
-
-
 def quoted(*words: str) -> str:
     """Return words of a command, quoted for a shell on one line.
 

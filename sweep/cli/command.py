@@ -255,6 +255,18 @@ def say(text: str = "") -> None:
     print("\n".join(plain(line, len(line)) for line in text.split("\n")))
 
 
+def duration(seconds: float) -> str:
+    """Return a time in the largest unit of which there are at least two.
+
+    >>> duration(90.0), duration(150.0), duration(1e6)
+    ('90.0 s', '2.5 min', '11.6 days')
+    """
+    for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.1f} s"
+
+
 def answer(found: Findings | int) -> int:
     """Print findings as JSON, Markdown or text, and what to do next; return the exit status."""
     if isinstance(found, int):

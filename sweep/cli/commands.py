@@ -19,7 +19,7 @@ from sweep.cli import command as cli
 from sweep.cli.command import Names, Numbers
 from sweep.errors import ArgumentError, check_positive
 from sweep.isolation.child_process import Child, default_workers
-from sweep.messages import duration, plain, quoted
+from sweep.messages import plain, quoted
 
 if TYPE_CHECKING:
     from sweep.evaluation.inspection import SceneInspection
@@ -261,7 +261,7 @@ def _expected(pipeline: Pipeline, expected: SimpleNamespace) -> list[str]:
                  f"in {expected.files:,} files",
         "memory": f"{filesize.decimal(expected.worker_bytes)} a worker",
         "cost": f"{over}{1e3 * expected.pose_s:.3g} ms a pose ({sampled}{ended})",
-        "time": f"{most}{over}{duration(expected.seconds)} {how}",
+        "time": f"{most}{over}{cli.duration(expected.seconds)} {how}",
     }
     return [f"{name:8} {text}" for name, text in rows.items()]
 
@@ -442,7 +442,7 @@ def status(store: str) -> Findings:
     if state.poses_per_s is not None:
         rows["rate"] = f"{state.poses_per_s:,.0f} poses/s"
     if state.seconds_left is not None:
-        rows["time left"] = duration(state.seconds_left)
+        rows["time left"] = cli.duration(state.seconds_left)
     lines = [f"{state.title}: {what}", *(f"  {name:11} {text}" for name, text in rows.items())]
     for kind, cells in (("crashed", state.crashed), ("failed", state.failed)):
         lines += cli.listed(
@@ -480,6 +480,7 @@ def verify(
         cli.SESSION.stopped = cli.CONTINUES
         report = library.verification.repair(store, sample, workers=workers)
     else:
+        check_positive("workers", workers, "expected at least 1", whole=True)
         report = library.verification.verify(store, sample)
     lines, damaged = [], report.damage
     for what, damages in (("repaired", report.repaired), ("damaged", damaged)):

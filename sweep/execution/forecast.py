@@ -22,7 +22,6 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildError, default_workers
 from sweep.isolation.watchdog import compilation_s
-from sweep.messages import duration
 from sweep.sampling.rules import Stopping, make_rule
 from sweep.store.locations import is_remote
 
@@ -254,7 +253,7 @@ def least_share(rule: Stopping | None) -> float:
 #: Seconds of a run apart from its blocks: processes start and end, packages are imported.
 START_S = 1.5
 
-#: Seconds from which on a run has to be confirmed.
+#: Seconds from which on a run has to be confirmed: a day.
 MAX_S = 86_400.0
 
 
@@ -276,7 +275,7 @@ def forecast_of(
     objections, free = [], free_bytes(url)
     if seconds > MAX_S:
         about = "about" if pipeline.stopping is None else "up to"
-        objections.append(f"takes {about} {duration(seconds)} with {workers} "
+        objections.append(f"takes {about} {seconds / MAX_S:.1f} days with {workers} "
                           f"worker{'s' if workers > 1 else ''}")
     if size > free:
         objections.append(f"writes {filesize.decimal(size)} before compression, and "

@@ -104,6 +104,7 @@ def execute(
         announce_compilation(pipeline)
     url = errors.path_of("store", store) if store is not None else f"runs/{pipeline.name}.zarr"
     begun = _store_to_continue(url, pipeline, overwrite)
+    sources = _matching_sources(url, pipeline, reuse)
     done = set() if begun is None else blocks.committed(begun)
     again = status.failed_blocks(begun, done) if begun and options["retry_failed"] else {}
     stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
@@ -112,7 +113,6 @@ def execute(
         return status.summary_of(begun, {}, time.perf_counter() - started, {})
     done -= again.keys()
     notice(*pipeline.facts.notes)
-    sources = _matching_sources(url, pipeline, reuse)
     if begun is None:
         check_writable(url)
     elif is_written(begun.storage):

@@ -100,7 +100,7 @@ def beliefs(given: Mapping[str, Any]) -> dict[str, Any]:
         A line for each setting that is not known or cannot be.
     """
     values, faults = check_table(
-        BELIEFS, {name: value for name, value in given.items() if value not in {None, ""}},
+        BELIEFS, {name: value for name, value in given.items() if value not in (None, "")},
         "sweep diagnose")
     if faults:
         raise refusal(faults)
@@ -283,8 +283,8 @@ def _cells(source: str | os.PathLike[str] | Mapping[str, Sequence[Any]]) -> pd.D
     header, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines)] or [[]]
     _each_row([len(row) == len(header) for row in rows],
               f"expected {len(header)} cells, commas between them, and points in numbers")
-    if repeated := [name for name in COLUMNS if header.count(name) > 1]:
-        raise _fault(f"column {repeated[0]} is there twice")
+    if repeated := [name for name in header if header.count(name) > 1]:
+        raise _fault(f"column {plain(repeated[0])} is there twice")
     return pd.DataFrame(rows, columns=header)
 
 

@@ -351,8 +351,8 @@ def _no_marker(board: Board, find: FindFunction, tried: Sequence[Photograph]) ->
     counts[f"{board.dictionary} in the mirror image"] = count(board.dictionary, 1)
     best = max(counts, key=lambda name: counts[name])
     return f"no photograph shows a marker of {board.dictionary}; " + (
-        f"there are {counts[best]} of {best} in the first {len(tried)}" if counts[best] > 1
-        else "check that the board is in focus and wholly lit"
+        f"there are {counts[best]} of {best} in the first {len(tried)}"
+        if counts[best] >= MIN_JUDGED else "check that the board is in focus and wholly lit"
     )
 
 

@@ -868,9 +868,11 @@ def fit(
         for each in found.terms]
     size = next(each.estimate for each in found.terms if each.parameter == "marker_scale")
     value, low, high = (100.0 * (each - 1.0) for each in size)
-    line = (f"markers are larger than their file says by {value:.2f} % [{low:.2f}, {high:.2f}]: "
+    line = (f"markers are {value:+.2f} % [{low:+.2f}, {high:+.2f}] larger than their file says: "
             "measure the print")
-    said = [line] if "marker_scale" in found.scene and math.isfinite(low) else []
+    # What no caliper shows is not said.
+    told = "marker_scale" in found.scene and math.isfinite(low) and abs(value) >= 0.05
+    said = [line] if told else []
     lines = [library.table.Table.of(
         f"{found.markers} markers in {found.photographs} photographs; 95 % intervals by photograph,"
         " from 4 on", ("term", "parameter", "value", ""), rows, stub=2, words=True),

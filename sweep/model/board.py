@@ -105,6 +105,8 @@ class Board:
     margin
         How far a marker alone extends beyond its square, its overhang and its quiet zone, in
         modules; None of a board.
+    squares_m
+        Side of the black squares at the markers' corners; 0 if there are none.
     """
 
     dictionary: str
@@ -115,6 +117,7 @@ class Board:
     chessboard: Chessboard | None = None
     distractors: tuple[Print, ...] = ()
     margin: float | None = None
+    squares_m: float = 0.0
 
     def __len__(self) -> int:
         return len(self.marker_ids)

@@ -377,9 +377,9 @@ class _OnSheet:
 
     def _on_sheet(
         self, centres_m: Floats, marker_m: float, others: Sequence[Print], half_m: Floats,
-        roll_deg: float = 0.0,
+        roll_deg: float = 0.0, squares_m: float = 0.0,
     ) -> Board:
-        """Return markers at ``centres_m`` (n, 2) with other prints.
+        """Return markers at ``centres_m`` (n, 2) with other prints, such as ``squares_m``.
 
         The sheet extends ``half_m`` (2,) and the margin from the origin.
         """
@@ -394,7 +394,7 @@ class _OnSheet:
         sheet = board.rectangles_print(np.array([[*-beyond, *beyond]]), OUTSIDE, WHITE)
         return Board(
             self.dictionary, ids, np.array(corners), (*prints, *others, sheet),
-            np.empty((0, 3)),
+            np.empty((0, 3)), squares_m=squares_m,
         )
 
 
@@ -416,7 +416,7 @@ class _OnSheet:
         row, column = np.indices((shape[0] + 1, shape[1] + 1)).reshape(2, -1)
         low = np.stack([column, row], axis=1) * step - gap_m - middle
         others = [board.rectangles_print(np.hstack([low, low + gap_m]), WHITE, BLACK)]
-        return self._on_sheet(centres, marker_m, others, middle + gap_m, roll_deg)
+        return self._on_sheet(centres, marker_m, others, middle + gap_m, roll_deg, gap_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,9 +19,9 @@ from sweep.errors import ArgumentError, SweepError
 from sweep.experiment.photographs import board_of
 from sweep.measure.detectors import DetectorSetting, FindFunction, make_detector
 from sweep.messages import nearest_file, plain, shown
-from sweep.model.board import Board
+from sweep.model.board import Board, unit_m
 from sweep.model.image_file import IMAGE_SUFFIXES, Part, decode_grey, read_image
-from sweep.model.marker import opencv_dictionary_names
+from sweep.model.marker import module_count, opencv_dictionary_names
 from sweep.model.polygon import side_lengths
 from sweep.typing import Floats, Integers
 
@@ -182,14 +182,19 @@ def detect_markers(
 # Corners of a board in a photograph, without a model of the camera.
 #
 # Of a board with a chessboard they are the chessboard's inner corners: the neighbouring markers'
-# homography says where they are about, and ``cv2.cornerSubPix`` measures them. Of other boards
-# they are the markers' corners, as OpenCV refines them.
+# homography says where they are about, and ``cv2.cornerSubPix`` measures them. So are the markers'
+# corners of a board with black squares at them, whose outlines run together with the markers': a
+# detector's corners may be off by pixels. Of other boards they are the markers' corners, as OpenCV
+# refines them.
 
 #: Markers whose corners give the homography around a corner of the chessboard.
 NEIGHBOURS = 4
 
-#: Half window of the search, as a share of the distance to the nearest corner of a marker.
+#: Half window of the search, as a share of the distance to what else is printed.
 WINDOW_SHARE = 0.8
+
+#: A corner, and where something else may be printed around it.
+CROSS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 #: Half windows, in pixels.
 MIN_WINDOW, MAX_WINDOW = 2, 11
@@ -214,26 +219,30 @@ class FoundCorners(NamedTuple):
 def find_corners(image: NDArray[np.uint8], board: Board, seen: SeenMarkers) -> FoundCorners:
     """Return the corners of a board in an image in which markers were detected."""
     marker, quads = seen.among(board.marker_ids)
-    if board.chessboard is None:
-        return FoundCorners(
-            board.corners_m[marker].reshape(-1, 3), quads.reshape(-1, 2),
-            (4 * marker[:, None] + np.arange(4)).ravel(),
-        )
-    flat, square_m = board.corners_m[marker][..., :2], board.chessboard.square_m
+    if board.chessboard is not None:
+        points, step_m, clear_m = board.chessboard_m, board.chessboard.square_m, 0.0
+        number = np.arange(len(points))
+    else:
+        points = board.corners_m.reshape(-1, 3)
+        number = (4 * marker[:, None] + np.arange(4)).ravel()
+        if not board.squares_m:
+            return FoundCorners(points[number], quads.reshape(-1, 2), number)
+        step_m = unit_m(board) * module_count(board.dictionary) + board.squares_m
+        clear_m = min(unit_m(board), board.squares_m)  # up to the marker's bits
+    flat = board.corners_m[marker][..., :2]
     found = {
-        number: pixel for number, point in enumerate(board.chessboard_m[:, :2])
-        if (pixel := _chessboard_corner(image, point, flat, quads, square_m)) is not None
+        k: pixel for k in number.tolist()
+        if (pixel := _saddle(image, points[k, :2], flat, quads, step_m, clear_m)) is not None
     }
     number = np.array(list(found), dtype=np.int64)
-    return FoundCorners(
-        board.chessboard_m[number], np.array(list(found.values())).reshape(-1, 2), number
-    )
+    return FoundCorners(points[number], np.array(list(found.values())).reshape(-1, 2), number)
 
 
-def _chessboard_corner(
-    image: NDArray[np.uint8], point: Floats, flat: Floats, quads: Floats, square_m: float
+def _saddle(
+    image: NDArray[np.uint8], point: Floats, flat: Floats, quads: Floats, step_m: float,
+    clear_m: float,
 ) -> Floats | None:
-    """Return the pixel (2,) of a chessboard's corner between markers; None if it is not found.
+    """Return the pixel (2,) of a corner at which two black squares meet; None if it is not found.
 
     Parameters
     ----------
@@ -241,20 +250,22 @@ def _chessboard_corner(
         Grey levels.
     point, flat, quads
         The corner (2,) and the markers' corners (k, 4, 2) on the board, and the latter's pixels.
-    square_m
-        Side of the chessboard's squares.
+    step_m
+        Side of the chessboard's squares, or from marker to marker of an AprilGrid.
+    clear_m
+        Distance within which nothing else is printed; 0: up to the nearest marker's corner.
     """
     distance = np.abs(flat.mean(axis=1) - point).max(axis=1)
     near = np.argsort(distance, kind="stable")[:NEIGHBOURS]
-    near = near[distance[near] < 2.1 * square_m]
-    if len(near) < 2 or distance[near[0]] > 1.01 * square_m:
+    near = near[distance[near] < 2.1 * step_m]
+    if len(near) < 2 or distance[near[0]] > 1.01 * step_m:
         return None
     transform, _ = cv2.findHomography(flat[near].reshape(-1, 2), quads[near].reshape(-1, 2))
     if transform is None:
         return None
-    mapped = np.asarray(transform) @ [*point, 1.0]
-    start = mapped[:2] / mapped[2]
-    offset = np.abs(quads[near].reshape(-1, 2) - start).max(axis=1).min()
+    start, *around = cv2.perspectiveTransform((point + clear_m * CROSS)[None], transform)[0]
+    others = around if clear_m else quads[near]
+    offset = np.abs(np.reshape(others, (-1, 2)) - start).max(axis=1).min()
     half = int(np.clip(WINDOW_SHARE * offset, MIN_WINDOW, MAX_WINDOW))
     border = half + 2
     if not ((border <= start) & (start < np.array(image.shape[::-1]) - border)).all():
@@ -330,11 +341,9 @@ def check_board(
         fault = (f"none of its markers is in the photographs, which show IDs {shown(sorted(ids))}; "
                  "correct first_id or ids")
     elif odd and len(odd) < len(photographs) / 2:
-        raise fault_of(
-            folder, f"{named(odd)}: less than {100 * MIN_OWN:.0f} % of the markers lie where the "
-            f"board has them, unlike in {len(photographs) - len(odd)} other photographs; move "
-            "those of another board elsewhere",
-        )
+        raise fault_of(folder, f"{named(odd)}: less than {100 * MIN_OWN:.0f} % of the markers lie "
+                       f"where the board has them, unlike in {len(photographs) - len(odd)} other "
+                       "photographs; move those of another board elsewhere")
     else:
         fault = _misfit(document, board, seen)
     if fault:
@@ -352,7 +361,7 @@ def _no_marker(board: Board, find: FindFunction, tried: Sequence[Photograph]) ->
     best = max(counts, key=lambda name: counts[name])
     return f"no photograph shows a marker of {board.dictionary}; " + (
         f"there are {counts[best]} of {best} in the first {len(tried)}"
-        if counts[best] >= MIN_JUDGED else "check that the board is in focus and wholly lit"
+        if counts[best] >= len(tried) else "check that the board is in focus and wholly lit"
     )
 
 

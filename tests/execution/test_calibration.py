@@ -16,19 +16,6 @@ import pytest
 from support.clusters import Cluster
 from support.here import Here
 from sweep.execution import forecast
-from sweep.execution.forecast import (
-    BLOCK_S,
-    BLOCKS_PER_S,
-    MAX_BLOCKS,
-    TIMING_LIMIT_S,
-    UNMEASURED_S,
-    Timing,
-    block_time_limit_s,
-    blocks_of,
-    forecast_of,
-    measure,
-    process_count,
-)
 from sweep.experiment.grid import Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -38,22 +25,23 @@ PIPELINE = Pipeline.from_text("[pose]\nside_px = 20\njitter_px = 0.5\n[axes]\ntr
 
 
 @pytest.mark.parametrize(("error", "timing"), [
-    (ChildDiedError("time limit", timed_out=True), Timing(TIMING_LIMIT_S, 1, over=True)),
-    (ChildDiedError("SIGSEGV"), Timing(UNMEASURED_S, 0)),
+    (ChildDiedError("time limit", timed_out=True),
+     forecast.Timing(forecast.TIMING_LIMIT_S, 1, over=True)),
+    (ChildDiedError("SIGSEGV"), forecast.Timing(forecast.UNMEASURED_S, 0)),
 ])
 def test_scenes_that_take_too_long_or_crash_are_taken_for_slow_ones(error, timing):
     child = Here()
     child.call = mock.Mock(side_effect=error)
-    assert measure(child, PIPELINE) == timing
-    blocks = blocks_of(PIPELINE, timing.pose_s, 2)
-    assert math.prod(blocks.extents) <= max(BLOCK_S / timing.pose_s, 1)
+    assert forecast.measure(child, PIPELINE) == timing
+    blocks = forecast.blocks_of(PIPELINE, timing.pose_s, 2)
+    assert math.prod(blocks.extents) <= max(forecast.BLOCK_S / timing.pose_s, 1)
 
 
 def test_processes_are_counted_by_the_work_that_is_left():
-    timing = Timing(1.5 * forecast.SMALL_RUN_S / PIPELINE.size(Stage.scene), 50)
-    assert process_count(PIPELINE, timing, None) == len(os.sched_getaffinity(0))
-    assert process_count(PIPELINE, timing, None, 0.5) == 1
-    assert process_count(PIPELINE, timing, 3, 0.5) == 3
+    timing = forecast.Timing(1.5 * forecast.SMALL_RUN_S / PIPELINE.size(Stage.scene), 50)
+    assert forecast.process_count(PIPELINE, timing, None) == len(os.sched_getaffinity(0))
+    assert forecast.process_count(PIPELINE, timing, None, 0.5) == 1
+    assert forecast.process_count(PIPELINE, timing, 3, 0.5) == 3
 
 
 @pytest.mark.parametrize(
@@ -70,14 +58,14 @@ def test_blocks_grow_with_the_cluster_and_with_the_run(poses, scene_s, workers, 
     pipeline = Pipeline.from_text(
         f"[pose]\njitter_px = 0.5\n[axes]\nside_px = [20, 40]\ntrial = {poses // 2}"
     )
-    cut = blocks_of(pipeline, scene_s, workers)
+    cut = forecast.blocks_of(pipeline, scene_s, workers)
     extents, blocks = cut.extents, len(cut)
     assert math.prod(extents) * scene_s == pytest.approx(block_s, rel=0.15)
-    assert blocks <= 1.1 * max(BLOCKS_PER_S * poses * scene_s / workers, 6 * workers)
-    assert blocks <= MAX_BLOCKS
-    assert block_time_limit_s(None, math.prod(extents) * scene_s) == pytest.approx(
+    assert blocks <= 1.1 * max(forecast.BLOCKS_PER_S * poses * scene_s / workers, 6 * workers)
+    assert blocks <= forecast.MAX_BLOCKS
+    assert forecast.block_time_limit_s(None, math.prod(extents) * scene_s) == pytest.approx(
         max(600.0, 10 * block_s), rel=0.15)
-    limited = blocks_of(pipeline, scene_s, workers, 30.0)
+    limited = forecast.blocks_of(pipeline, scene_s, workers, 30.0)
     assert math.prod(limited.extents) * scene_s == pytest.approx(
         min(block_s, 3.0), rel=0.15, abs=scene_s)
 
@@ -97,10 +85,11 @@ def test_no_grid_of_a_billion_poses_makes_more_blocks_and_files_than_a_disk_can_
     )
     pipeline = Pipeline.from_text(
         f"[pose]\njitter_px = 0.5\n[axes]\n{axes}\ntrial = {lengths[-1]}")
-    blocks = blocks_of(pipeline, scene_s, 64)
-    assert len(blocks) <= MAX_BLOCKS
-    assert forecast_of(".", pipeline, Timing(scene_s, 1), blocks, 64).files <= 3_000_000
-    assert math.prod(blocks.extents) * scene_s < 2.5 * math.prod(lengths) * scene_s / MAX_BLOCKS
+    blocks = forecast.blocks_of(pipeline, scene_s, 64)
+    assert len(blocks) <= forecast.MAX_BLOCKS
+    timing = forecast.Timing(scene_s, 1)
+    assert forecast.forecast_of(".", pipeline, timing, blocks, 64).files <= 3_000_000
+    assert math.prod(blocks.extents) < 2.5 * math.prod(lengths) / forecast.MAX_BLOCKS
 
 
 SUPPORT = Path(__file__).parents[1] / "support"

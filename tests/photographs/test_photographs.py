@@ -13,6 +13,7 @@ from support.board_photographs import (
     VIEW,
     board,
     camera,
+    image,
     marker_poses,
     write_set,
 )
@@ -20,18 +21,13 @@ from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.analysis import error_statistics
 from sweep.errors import ArgumentError, SweepError
 from sweep.evaluation.inspection import scene_image
+from sweep.experiment.photographs import board_of
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, TruthSource
 from sweep.model.calibration import Calibration
-from sweep.photographs.cameras import (
-    calibrate,
-    camera_of_file,
-    covariance_of,
-    derivatives,
-    fit_pose,
-)
-from sweep.photographs.folder import FoundCorners
+from sweep.photographs import cameras
+from sweep.photographs import folder as reading
 from sweep.photographs.prepare import prepare, record_of, twin_pipeline, unshared_variance
 
 
@@ -238,6 +234,18 @@ def test_only_photographs_have_twins(prepared):
             twins.to_toml() + "\n[pose]\ndistance_m = 1\n", folder=prepared.folder)
 
 
+def test_corners_that_touch_black_squares_are_where_they_were_printed():
+    """A detector's corners are pixels off there: outlines of markers and squares join."""
+    grid = board_of({"kind": "aprilgrid", "dictionary": "DICT_APRILTAG_36h11", "tagRows": 2,
+                     "tagCols": 3, "tagSize": 0.035, "tagSpacing": 0.3}, "board")
+    for number, (turn, shift) in enumerate(POSES[:4]):
+        photograph = image((turn, shift), number, printed=grid)
+        seen = reading.detect_markers(reading.reference_detector(), photograph, grid.dictionary)
+        found = reading.find_corners(photograph, grid, seen)
+        assert len(found.number) >= 10
+        assert np.abs(found.pixels - imaged(found.points, turn, shift)).max() < 0.2
+
+
 CAMERA = Calibration(*SIZE, *VIEW, (0.1, -0.2, 0.001, -0.001, 0.05), (), ())
 
 
@@ -245,16 +253,16 @@ def seen(number, rng, sd_px):
     """Return the chessboard's corners in a photograph, with an error."""
     turn, shift = POSES[number]
     points = board().chessboard_m
-    exact, *_ = derivatives(CAMERA, points, turn, np.array(shift))
+    exact, *_ = cameras.derivatives(CAMERA, points, turn, np.array(shift))
     pixels = exact + rng.normal(0, sd_px, exact.shape)
-    return FoundCorners(points, pixels, np.arange(len(points)))
+    return reading.FoundCorners(points, pixels, np.arange(len(points)))
 
 
 def test_the_covariance_of_a_calibration_has_opencvs_standard_deviations():
     rng = np.random.default_rng(1)
     turned = [seen(number, rng, 0.2) for number in range(len(POSES))]
-    made, _ = calibrate(SIZE, turned)
-    covariance = covariance_of(made)
+    made, _ = cameras.calibrate(SIZE, turned)
+    covariance = cameras.covariance_of(made)
     assert np.sqrt(np.diag(covariance)) == pytest.approx(made.sd, rel=1e-3)
     # Both focal lengths rest on the same depths.
     assert covariance[0, 1] > 0.5 * np.sqrt(covariance[0, 0] * covariance[1, 1])
@@ -263,7 +271,7 @@ def test_the_covariance_of_a_calibration_has_opencvs_standard_deviations():
 def test_a_camera_that_does_not_fit_its_photographs_is_refused():
     turned = [seen(number, np.random.default_rng(number), 4.0) for number in range(len(POSES))]
     with pytest.raises(ArgumentError, match="px RMS beside the camera; expected at most"):
-        calibrate(SIZE, turned)
+        cameras.calibrate(SIZE, turned)
 
 
 @pytest.mark.parametrize("number", [0, 2])
@@ -278,15 +286,15 @@ def test_what_truth_and_estimates_do_not_share_is_that_of_fitted_poses(number):
     centre = own.mean(axis=0)
     own, others = own - centre, board().chessboard_m - centre
     position = turn @ centre + shift
-    pixels = [derivatives(CAMERA, points, turn, position)[0] for points in (own, others)]
-    pose = fit_pose(CAMERA, others, pixels[1], turn, position)
+    pixels = [cameras.derivatives(CAMERA, points, turn, position)[0] for points in (own, others)]
+    pose = cameras.fit_pose(CAMERA, others, pixels[1], turn, position)
     predicted = np.sqrt(unshared_variance(CAMERA, covariance, pose, others, own))
     errors = []
     for _ in range(200):
         numbers = np.array([*VIEW, *CAMERA.distortion]) + factor @ rng.normal(size=9)
         wrong = Calibration(*SIZE, *numbers[:4], tuple(numbers[4:]), (), ())
         alone, truth = (
-            fit_pose(wrong, points, image, turn, position, np.ones(len(points), dtype=bool))
+            cameras.fit_pose(wrong, points, image, turn, position, np.ones(len(points), dtype=bool))
             for points, image in zip((own, others), pixels, strict=True)
         )
         turned = cv2.Rodrigues(alone.rotation @ truth.rotation.T)[0].ravel()
@@ -299,5 +307,5 @@ def test_a_files_covariance_is_that_of_its_numbers(tmp_path):
     path = tmp_path / "camera.json"
     matrix = np.diag(np.arange(1.0, 10.0)).ravel().tolist()
     path.write_text(camera()[:-1] + f', "covariance_intrinsics": {matrix}}}')
-    covariance = covariance_of(camera_of_file(str(path), SIZE))
+    covariance = cameras.covariance_of(cameras.camera_of_file(str(path), SIZE))
     assert np.diag(covariance).tolist() == list(range(1, 10))

@@ -288,14 +288,14 @@ def _detected(
     given = {setting_name(each) for each in settings}
     if board is not None and (twice := given & {"dictionary", "size_m", "marker_id"}):
         raise ArgumentError("settings", min(twice), "expected none beside a board, which says it")
-    if board is None and not {"dictionary", "size_m"} <= given:
-        raise ArgumentError(
-            "board", "none", "expected the file of a board, or `--set dictionary=...` and "
-            "`--set size_m=...` of single markers",
-        )
     fixed: dict[str, Any] = {"dictionary": board.dictionary} if board is not None else dict(
         Pipeline.from_dict({"pose": {"distance_m": 1.0}}, settings, source="--set").fixed
     )
+    if board is None and not {"dictionary", "size_m"} <= given & fixed.keys():
+        raise ArgumentError(
+            "board", "none", "expected the file of a board, or `--set dictionary=...` and "
+            "`--set size_m=...` of single markers, one value each",
+        )
     find, dictionary = folder.reference_detector(), str(fixed["dictionary"])
     # What the usual detector does not see, another one under test may.
     faint = None if board is None else folder.reference_detector(**folder.FAINT)

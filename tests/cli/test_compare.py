@@ -16,15 +16,15 @@ from sweep.report.findings import gap_lines, gap_table
 def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():
     rng = np.random.default_rng(1)
     first, second = results_of(rng), twins(rng)
-    gap = simulation_gap(first, second, bins={"side_px": [20, 40, 70]})
+    gap = simulation_gap(first, second, bins={"side_px": [1, 20, 40, 70]})  # none in the first
     table = gap_table(gap)
     assert list(table.headings) == [
         "statistic", "cornerRefinementMethod", "side_px", "photographs", "simulated",
         "compared by", "gap"]
-    assert len(table.rows) == 7 * 2 * 2
+    assert len(table.rows) == 7 * 2 * 3
     row = next(row for row in table.rows
                if row[:3] == ["range bias median, %", "subpix", "20\u201340"])
-    at = gap.sel(cornerRefinementMethod="subpix").isel(side_px=0)
+    at = gap.sel(cornerRefinementMethod="subpix").isel(side_px=1)
     assert float(row[3].replace("\u2212", "-")) == pytest.approx(
         at.range_bias_median_percent.values[0], rel=0.01)
     assert "to" in row[6]

@@ -1166,9 +1166,9 @@ def in_bins(columns: Arrays, edges: Edges, design: Design) -> Iterator[Arrays]:
     for index in np.ndindex(*(len(each) - 1 for each in edges.values())):
         inside = np.logical_and.reduce([a == b for a, b in zip(numbers, index, strict=True)])
         cells, = inside.any(axis=(0, 2, 3)).nonzero()
-        seen = inside[:, cells].any(axis=3) | (design.unit != "trial")
-        most = seen.sum(axis=2).max(initial=1) if design.unit == "trial" else seen.shape[2]
-        draws = np.argsort(~seen, axis=2, kind="stable")[..., :most].astype(np.int32)
+        seen = inside.any(axis=3) | (design.unit != "trial")
+        most = seen.sum(axis=2).max(initial=1)
+        draws = np.argsort(~seen[:, cells], axis=2, kind="stable")[..., :most].astype(np.int32)
         part, at = {**columns, INSIDE: inside}, np.arange(len(draws))[:, None, None]
         # In memory the draws stay side by side, as `_column` arranges them.
         yield part if draws.size == inside[..., 0].size else {name: np.moveaxis(np.moveaxis(

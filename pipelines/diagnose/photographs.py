@@ -10,7 +10,6 @@ detection and of the photographs' own truth (`truth_std`).
 """
 
 import itertools
-import math
 import sys
 
 import numpy as np
@@ -63,15 +62,15 @@ def by_chance(whitened, photograph, times=1, draws=DRAWS):
 
 
 def deciding(whitened, photograph):
-    """Return how many photographs would decide, infinite if 16 times as many would not.
+    """Return in words how many photographs would decide, up to 16 times as many.
 
     There 95 % of a perfect covariance's divergences are below 95 % of one's that is `LIMIT` off.
     """
     for times in range(1, 17):
         perfect, off = by_chance(whitened, photograph, times, 200)
         if np.quantile(perfect, 0.95) < np.quantile(off, 0.05):
-            return times * len(np.unique(photograph))
-    return math.inf
+            return f"{times * len(np.unique(photograph))}"
+    return f"more than {times * len(np.unique(photograph))}"
 
 
 def print_divergences(found):

@@ -261,8 +261,8 @@ CAUSES = (
           "measure the square whose corners are detected with a caliper, flat on a table",
           lambda rows: ratios(size_ratios(rows.dictionary), 0.6, (1, 1, 1), 0.05), _scaled),
     Cause(FOCAL, "wrong focal length (resolution, another camera, crop, autofocus)", 2.5,
-          "photograph a ruler in the image's middle and at its edge: f is its pixels times distance"
-          " / length; if they differ, give the lens' distortion; compare the file's image size",
+          "photograph a ruler in the middle and at the edge: f is its pixels times distance / "
+          "length; if they differ, give the lens' distortion; compare image sizes with the file's",
           _focal_ways, lambda _, points, spread: [points * spread * [0.0, 0.0, 1.0]]),
     Cause("units", "units taken for one another (m, cm, mm, inch, foot)", 1.0,
           "print size and tvec with their units", _unit_ways, _scaled),

@@ -89,11 +89,14 @@ class System(NamedTuple):
     images
         (6, height, width): the level's slopes by contrast, tone, x, y, the point spread's variance
         and the area outside, all as shares of the contrast.
+    drawn
+        (18,) the state that was drawn last.
     """
 
     rates: Floats
     outside: Floats
     images: Floats
+    drawn: Floats
 
 
 @compiled
@@ -101,7 +104,7 @@ def system(height: int, width: int) -> System:
     """Return the scratch space for a box."""
     return System(
         np.zeros((height, 4 * (width + 1))), np.zeros((height, width + 1)),
-        np.empty((6, height, width)),
+        np.empty((6, height, width)), np.zeros(likelihood.STATE_LENGTH),
     )
 
 
@@ -340,8 +343,9 @@ def rays_of(optics: Optics, height: int, width: int) -> Floats:
 @compiled
 def draw(view: PhotographView, state: Floats, work: System) -> None:
     """Write the images of a state to ``work.images``."""
-    rates, outsides, images = work
+    rates, outsides, images, _ = work
     height, width = view.levels.shape
+    likelihood.overwrite(work.drawn, state)
     add_plane(
         work, view.marker.edges, np.array([state[OUTSIDE_SHARE], 0.0, 1.0]),
         Projection(likelihood.plane_of(state, view.marker), view.marker.optics), state[SPREAD],
@@ -698,6 +702,10 @@ SIGNIFICANT = 2.0
 #: Largest correlation of neighbouring pixels that is assumed.
 MAX_CORRELATION = 0.9
 
+#: Most turn by a fit's last step: up to there the image before it serves the pose after it, whose
+#: levels differ by what the equations below eliminate anyway.
+LAST_STEP_RAD = math.radians(1.0)
+
 #: Components of nodes that move a pixel's level: two of each of the four nodes around it.
 HELD = 8
 
@@ -830,10 +838,8 @@ def _lagged(residuals: Floats, view: PhotographView, down: int, right: int) -> f
 
 @compiled
 def _ratio(lagged: float, variance: float) -> float:
-    """Return a correlation within bounds."""
-    if not variance > 0.0:
-        return 0.0
-    return min(max(lagged / variance, -MAX_CORRELATION), MAX_CORRELATION)
+    """Return a correlation within bounds; 0 of residuals that are all 0."""
+    return min(max(lagged / max(variance, 1e-300), -MAX_CORRELATION), MAX_CORRELATION)
 
 
 @compiled
@@ -846,13 +852,13 @@ def judge(
     NaN if there is no covariance.
 
     """
-    draw(view, state, work)
+    if likelihood.turn_between(work.drawn, state) > LAST_STEP_RAD:
+        draw(view, state, work)
     height, width = view.levels.shape
     pixels, nodes = pixel_count(view), 2 * SHIFT_NODES * SHIFT_NODES
     sums = _products(view, state, work.images)
-    total, mean_square = np.zeros((SIZE + 1 + nodes, SIZE + 1 + nodes)), 0.0
+    total = np.zeros((SIZE + 1 + nodes, SIZE + 1 + nodes))
     for cell in range(len(sums)):
-        mean_square += sums[cell, SIZE, SIZE] / pixels
         for k in range(SIZE + 1 + HELD):
             for m in range(SIZE + 1 + HELD):
                 total[_column(cell, k), _column(cell, m)] += sums[cell, max(k, m), min(k, m)]
@@ -868,8 +874,7 @@ def judge(
     schur = total[SIZE + 1 :, SIZE + 1 :] - likelihood.product(crossed.T, influence)
     pull -= likelihood.product(crossed.T, fitted)
     shifts, ridged = pull.copy(), schur.copy()
-    for k in range(SIZE):
-        mean_square -= fitted[k, 0] * levels[k, 0] / pixels
+    mean_square = (total[SIZE, SIZE] - (fitted * levels).sum()) / pixels
     for k in range(nodes):
         ridged[k, k] += max(mean_square, 0.0) / LARGEST_SHIFT_PX**2 + 1e-12
     if not solve_positive(ridged, shifts):
@@ -883,26 +888,23 @@ def judge(
     along = _ratio(_lagged(residuals, view, 1, 0), variance)
     variance *= pixels / freedom
     products = _correlated_products(field, view, across, along)
-    for m in range(POSE):
-        for k in range(POSE):
-            covariance[m, k] = variance * products[m, k]
     raised = 0.0
     for m in range(POSE):
-        raised += covariance[m, m] / (variance * inverse[m, m] * POSE) if variance > 0.0 else 0.0
-    spread = likelihood.product(schur, schur)
+        raised += products[m, m] / (inverse[m, m] * POSE)
     square_trace = (schur * schur).sum()
     # The noise alone gives a pull of that mean, and of this standard deviation.
     excess = (pull * pull).sum() - raised * variance * np.trace(schur)
     chance = SIGNIFICANT * raised * variance * math.sqrt(2.0 * square_trace)
-    shift_variance = excess / (_CORRELATIONS * spread).sum() if excess > chance else 0.0
+    expected = (_CORRELATIONS * likelihood.product(schur, schur)).sum()
+    shift_variance = excess / expected if excess > chance else 0.0
     misfit = math.sqrt(excess / square_trace) if excess > chance else 0.0
     of_pose = influence[:POSE]
     shifted = likelihood.product(of_pose, likelihood.product(_CORRELATIONS, of_pose.T))
     distance = abs(state[DEPTH])
     for m in range(POSE):
         for k in range(POSE):
-            covariance[m, k] += shift_variance * shifted[m, k]
-            covariance[m, k] *= (distance if m >= 3 else 1.0) * (distance if k >= 3 else 1.0)
+            scale = (distance if m >= 3 else 1.0) * (distance if k >= 3 else 1.0)
+            covariance[m, k] = scale * (variance * products[m, k] + shift_variance * shifted[m, k])
     return misfit
 
 
@@ -922,11 +924,13 @@ def _write_residuals(
             for j in range(stop - first):
                 column, out = columns[j], field[i, first + j]
                 residual = column[SIZE]
+                a = b = c = d = e = f = 0.0
                 for k in range(SIZE):
                     value, weight = column[k], inverse[k]
                     residual -= value * fitted[k, 0]
-                    for m in range(POSE):
-                        out[m] += value * weight[m]
+                    a, b, c = a + value * weight[0], b + value * weight[1], c + value * weight[2]
+                    d, e, f = d + value * weight[3], e + value * weight[4], f + value * weight[5]
+                out[0], out[1], out[2], out[3], out[4], out[5] = a, b, c, d, e, f
                 for k in range(HELD):
                     residual -= column[SIZE + 1 + k] * of_cell[k]
                 residuals[i, first + j] = residual

@@ -186,7 +186,7 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
     )
     turn, position = pose_of(CHARUCO, 5, pose)
     height, width = view.levels.shape
-    work, (beyond, _, _) = system(height, width), system(height + 1, width)
+    work, (beyond, *_) = system(height, width), system(height + 1, width)
     state = state_of(turn, position, 0.8, np.array([0.0, 0.0, 1.0]))
     draw(view, state, work._replace(rates=beyond[:-1]))
     assert not beyond.any()  # nothing is written below the image

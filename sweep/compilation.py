@@ -14,8 +14,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from sweep.errors import MachineFaultError, RunError
-from sweep.messages import local_fault
+from sweep.errors import MachineFaultError, RunError, local_fault
 
 try:
     numba: Any = importlib.import_module("numba")  # whose types lack options
@@ -58,14 +57,6 @@ compiled_inline = partial(compiled, forceinline=True)
 #: As :func:`compiled`; several like statements on neighbours in memory are computed at once (LLVM's
 #: SLP vectoriser, which Numba leaves out). The arithmetic stays the same.
 compiled_packed = partial(compiled, packed=True)
-
-
-def is_cached(module: str, name: str) -> bool:
-    """Return whether a function of a module is in the cache, or compilation is switched off."""
-    function = getattr(importlib.import_module(module), name)
-    with contextlib.suppress(Exception):  # there is no cache, or its use says that it is damaged
-        return bool(function._cache._cache_file._load_index())  # noqa: SLF001
-    return not hasattr(function, "_cache")
 
 
 def _compile(packed: bool, dispatcher: Any, compile_signature: Any, signature: Any) -> Any:

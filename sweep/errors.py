@@ -5,8 +5,14 @@ from __future__ import annotations
 import math
 import numbers
 import os
+import socket
 from collections.abc import Iterable, Sequence
 from typing import Any
+
+from sweep.messages import MAX_LINE_LENGTH, plain
+
+#: Faults of a pipeline that are listed; the others are counted.
+MAX_FAULTS = 20
 
 
 class SweepError(Exception):
@@ -23,11 +29,14 @@ class PipelineError(SweepError):
     Parameters
     ----------
     faults
-        One line a fault, each naming file, key, value and what was expected.
+        One line a fault, each naming file, key, value and what was expected. The first
+        :data:`MAX_FAULTS` are told, without control characters.
     """
 
     def __init__(self, faults: Sequence[str]) -> None:
-        self.faults = tuple(faults)
+        self.faults = tuple(plain(fault, MAX_LINE_LENGTH) for fault in faults[:MAX_FAULTS])
+        if len(faults) > MAX_FAULTS:
+            self.faults += (f"... and {len(faults) - MAX_FAULTS:,} faults more",)
 
     def __str__(self) -> str:
         return "\n".join(self.faults)
@@ -99,10 +108,6 @@ class DatasetError(StoreError):
     """
 
 
-class StoreReplacedError(StoreError):
-    """A store that was moved, deleted or replaced by another run's while a run wrote it."""
-
-
 class RunError(SweepError):
     """A run that failed; finished blocks stay in the store, and another run continues."""
 
@@ -110,8 +115,13 @@ class RunError(SweepError):
 class MachineFaultError(RunError):
     """A fault of a machine, which no scene's data can cause: it is not a result of the scene.
 
-    It names the machine and the fault (`sweep.messages.local_fault`).
+    It names the machine and the fault (:func:`local_fault`).
     """
+
+
+def local_fault(fault: str) -> MachineFaultError:
+    """Return the error that names a fault of this machine."""
+    return MachineFaultError(f"machine fault on {socket.gethostname()}: {plain(fault, 300)}")
 
 
 class PluginError(SweepError):

@@ -32,11 +32,10 @@ def check_installation() -> None:
     """
     try:
         import cv2  # noqa: PLC0415  (slow to import)
-    except ImportError as error:
-        raise StoreError(f"OpenCV cannot be imported: {plain(error)}; {REMEDY}") from None
-    loaded = f"OpenCV {getattr(cv2, '__version__', 'of no version')} is loaded"
-    if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
-        raise StoreError(f"{loaded}, which has no cv2.aruco.ArucoDetector: {REMEDY}")
+
+        loaded, _ = f"OpenCV {cv2.__version__} is loaded", cv2.aruco.ArucoDetector
+    except (ImportError, AttributeError) as error:
+        raise StoreError(f"OpenCV cannot be used: {plain(error)}; {REMEDY}") from None
     found = {name: package.version for name in (OPENCV, *OTHER_OPENCV)
              for package in distributions(name=name)}
     if [*found] != [OPENCV] and multiprocessing.parent_process() is None:  # else its client says it

@@ -30,6 +30,5 @@ if not TYPE_CHECKING:  # so that mypy knows the names above alone
     def __getattr__(name: str) -> Any:
         """Import a room's module when it is first used."""
         for path in Path(__file__).parent.glob(f"*/{name}.py"):
-            globals()[name] = importlib.import_module(f"sweep.{path.parent.name}.{name}")
-            return globals()[name]
+            return importlib.import_module(f"sweep.{path.parent.name}.{name}")
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -14,27 +14,13 @@ import json
 import os
 import re
 import shlex
-import socket
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from sweep.errors import MachineFaultError, PipelineError
-
-#: Faults that are listed; the others are counted.
-MAX_FAULTS = 20
-
 MAX_QUOTE_LENGTH = 120
 MAX_LINE_LENGTH = 1000
-
-
-def refusal(faults: Sequence[str]) -> PipelineError:
-    """Return the error that lists ``faults``, a line each."""
-    lines = [plain(fault, MAX_LINE_LENGTH) for fault in faults[:MAX_FAULTS]]
-    if len(faults) > MAX_FAULTS:
-        lines.append(f"... and {len(faults) - MAX_FAULTS:,} faults more")
-    return PipelineError(lines)
 
 
 def plain(text: object, most: int = MAX_QUOTE_LENGTH) -> str:
@@ -46,11 +32,6 @@ def plain(text: object, most: int = MAX_QUOTE_LENGTH) -> str:
     text = str(text)
     cut = text if len(text) <= most else text[: most - 3] + "..."
     return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in cut)
-
-
-def local_fault(fault: str) -> MachineFaultError:
-    """Return the error that names a fault of this machine."""
-    return MachineFaultError(f"machine fault on {socket.gethostname()}: {plain(fault, 300)}")
 
 
 def exception_line(error: BaseException) -> str:
@@ -65,7 +46,6 @@ def notice(*lines: str) -> None:
     """
     with contextlib.suppress(OSError, ValueError, AttributeError):
         sys.stderr.writelines(f"{plain(line, MAX_LINE_LENGTH)}\n" for line in lines)
-        sys.stderr.flush()
 
 
 def shown(value: Any) -> str:

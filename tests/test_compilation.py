@@ -105,7 +105,7 @@ def test_what_compiled_code_uses_is_declared_in_the_sources_of_the_digest():
 def test_first_use_is_announced_and_no_later_one(monkeypatch, capsys):
     cached = set()
     monkeypatch.setattr(
-        "sweep.compilation.is_cached", lambda module, name: f"{module}.{name}" in cached)
+        "sweep.execution.runner.is_cached", lambda module, name: f"{module}.{name}" in cached)
     plain = Pipeline.from_text("[pose]\nside_px = 50")
     bound = Pipeline.from_text(
         "[pose]\nside_px = 50\n[scene]\nnoise_grey = 2\nbound = 'known_blur'")

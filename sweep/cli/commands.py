@@ -194,7 +194,8 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
     count = costs.process_count(pipeline, timing, workers)
     blocks = costs.blocks_of(pipeline, timing.pose_s, count)
     expected = costs.forecast_of(
-        f"runs/{pipeline.name}.zarr", pipeline, timing, blocks, min(count, default_workers()))
+        f"runs/{pipeline.name}.zarr", pipeline, timing, blocks, min(count, default_workers()),
+        len(blocks))
     # Of a child that ended, the memory was at most this.
     process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     stages = library.parameters.Stage

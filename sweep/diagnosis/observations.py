@@ -15,13 +15,13 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from sweep.declaration import check_table
-from sweep.errors import ArgumentError, path_of
+from sweep.errors import ArgumentError, PipelineError, path_of
 from sweep.experiment.document import file_text
 from sweep.experiment.parameters import PARAMETERS
 from sweep.experiment.pipeline import parse_settings
 from sweep.measure.detectors import DetectorSetting, make_detector
 from sweep.measure.solver import both_planar_solutions
-from sweep.messages import nearest, plain, refusal
+from sweep.messages import nearest, plain
 from sweep.model.calibration import MAX_BYTES, Calibration
 from sweep.model.image_file import decode_grey
 from sweep.model.pose import mirrored, rotation_of_vector, vector_of_rotation
@@ -103,7 +103,7 @@ def beliefs(given: Mapping[str, Any]) -> dict[str, Any]:
         BELIEFS, {name: value for name, value in given.items() if value not in (None, "")},
         "sweep diagnose")
     if faults:
-        raise refusal(faults)
+        raise PipelineError(faults)
     return values
 
 

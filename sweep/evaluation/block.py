@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.errors import MachineFaultError
+from sweep.errors import MachineFaultError, local_fault
 from sweep.evaluation import results, variables
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
@@ -39,7 +39,7 @@ from sweep.measure.estimation import Detections, Estimates, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus
 from sweep.measure.likelihood import bounds, outside_model
-from sweep.messages import exception_line, local_fault
+from sweep.messages import exception_line
 from sweep.model.calibration import COEFFICIENTS, VIEW
 from sweep.model.camera import Cameras, Column
 from sweep.model.lens import pack

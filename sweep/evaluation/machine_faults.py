@@ -8,8 +8,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from sweep.errors import MachineFaultError, SweepError
-from sweep.messages import exception_line, local_fault
+from sweep.errors import MachineFaultError, SweepError, local_fault
+from sweep.messages import exception_line
 
 # --------------------------------------------------------------------------------------------------
 # Exceptions that a scene's data cannot cause: faults of the machine, which are never results.

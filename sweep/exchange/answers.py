@@ -13,9 +13,9 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from sweep.errors import ArgumentError, StoreError
+from sweep.errors import ArgumentError, PipelineError, StoreError
 from sweep.experiment.document import file_text
-from sweep.messages import nearest, plain, refusal
+from sweep.messages import nearest, plain
 from sweep.model.pose import rotation_of_vector
 from sweep.plugins.loading import OF_TARGET, REJECTED
 from sweep.typing import Floats, Integers
@@ -157,7 +157,7 @@ def _table(text: str, source: str, faults: dict[int, str]) -> pd.DataFrame:
     else:
         fault = ""
     if fault:
-        raise refusal([f"{source}: line {first}: {plain(fault, 300)}"])
+        raise PipelineError([f"{source}: line {first}: {plain(fault, 300)}"])
     faults |= {number: f"{len(row)} values; expected {len(header)}, as the header has"
                for number, row in rows.items() if len(row) != len(header)}
     table = pd.DataFrame.from_dict(
@@ -274,7 +274,7 @@ def read_answers(
               "here", first=first, what=("ID " + table["id"]).where(
                   ~of_target, "a pose without an ID"))
     if faults:
-        raise refusal([
+        raise PipelineError([
             f"{source}: line {line}: {plain(faults[line], 300)}" for line in sorted(faults)])
     rotation = np.full((len(table), 3, 3), np.nan)
     known = has_pose.to_numpy()

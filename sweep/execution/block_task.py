@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.errors import MachineFaultError, StoreError, StoreReplacedError
+from sweep.errors import MachineFaultError, StoreError, local_fault
 from sweep.evaluation.block import run_cells, warm_up
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.results import CellsResult, processor, to_dataset_layout
@@ -27,10 +27,9 @@ from sweep.experiment.sampling import StoppingRule
 from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
 from sweep.measure.flags import DetectionStatus, EstimateStatus, flag_counts
-from sweep.messages import local_fault
 from sweep.sampling.rules import Decider, Decision
 from sweep.store import blocks
-from sweep.store.blocks import Receipt, RunStore
+from sweep.store.blocks import Receipt, RunStore, StoreReplacedError
 from sweep.store.lifecycle import open_store
 from sweep.store.locations import exists
 from sweep.store.provenance import Source, both_axes, changes, fingerprint, match

@@ -10,12 +10,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
-from sweep.errors import StoreReplacedError
 from sweep.evaluation.machine_faults import machine_fault
 from sweep.execution.block_task import compute_block
 from sweep.isolation.child_process import POLL_S, Child, ChildDiedError, ChildError, Interrupts
 from sweep.messages import exception_line, notice
-from sweep.store.blocks import Receipt
+from sweep.store.blocks import Receipt, StoreReplacedError
 
 # --------------------------------------------------------------------------------------------------
 # The loop: blocks are submitted as long as there is room, and what becomes of them is yielded.

@@ -258,17 +258,15 @@ MAX_S = 86_400.0
 
 
 def forecast_of(
-    url: str, pipeline: Pipeline, timing: Timing, blocks: Blocks, workers: int,
-    left: int | None = None,
+    url: str, pipeline: Pipeline, timing: Timing, blocks: Blocks, workers: int, left: int
 ) -> SimpleNamespace:
-    """Return the expected cost of ``left`` of a run's blocks (default: all), waves or not.
+    """Return the expected cost of ``left`` of a run's blocks, waves or not.
 
     Returns
     -------
     ``files`` and ``bytes`` (before compression) that the run writes, the ``seconds`` that it takes,
     and ``objections``: why it has to be confirmed; none if it need not be.
     """
-    left = len(blocks) if left is None else left
     poses = math.ceil(pipeline.size(Stage.scene) * left / max(len(blocks), 1))
     size = pipeline.experiment.bytes_of(poses)
     seconds = START_S + poses * timing.pose_s / min(workers, max(left, 1))

@@ -17,14 +17,14 @@ from urllib.parse import urlsplit
 from distributed import Client, KilledWorker, LocalCluster, Security, get_worker, wait
 from distributed.core import rpc
 
-from sweep.errors import ArgumentError, RunError, StoreReplacedError
+from sweep.errors import ArgumentError, RunError
 from sweep.evaluation.results import differing_processors, processor
 from sweep.execution.block_task import compute_block, other_here
 from sweep.execution.executors import Executor, Failed, attempt
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import ADVICE, SINGLE_THREADED, default_workers
 from sweep.messages import exception_line, notice
-from sweep.store.blocks import Receipt
+from sweep.store.blocks import Receipt, StoreReplacedError
 from sweep.store.provenance import fingerprint
 
 # --------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Unpack
 
-from sweep import compilation, errors
+from sweep import errors
 from sweep.evaluation.block import try_plugins
 from sweep.execution import forecast, progress, status
 from sweep.execution.executors import Children, Executor, Failed
@@ -49,9 +49,17 @@ def announce_compilation(pipeline: Pipeline) -> None:
         "measure.photograph.locate_photograph": (30, "photometric_real" in used),
     }
     seconds = sum(length for name, (length, runs) in needed.items()
-                  if runs and not compilation.is_cached(*f"sweep.{name}".rsplit(".", 1)))
+                  if runs and not is_cached(*f"sweep.{name}".rsplit(".", 1)))
     if seconds:
         notice(f"compiling, once for this version: about {seconds} s")
+
+
+def is_cached(module: str, name: str) -> bool:
+    """Return whether a function of a module is in the cache, or compilation is switched off."""
+    function = getattr(importlib.import_module(module), name)
+    with contextlib.suppress(Exception):  # there is no cache, or its use says that it is damaged
+        return bool(function._cache._cache_file._load_index())  # noqa: SLF001
+    return not hasattr(function, "_cache")
 
 
 @progress.taking_run_options
@@ -153,7 +161,7 @@ def execute(
             computed = compute(begun, executor, sources, limit_s, interrupts, listener)
         except (errors.RunError, errors.StoreError) as error:
             first, *others = str(error).splitlines()
-            if not isinstance(error, errors.StoreReplacedError):
+            if not isinstance(error, blocks.StoreReplacedError):
                 first += f"; run it again{' without overwrite' if overwrite else ''} to continue"
             raise errors.RunError("\n".join([first, *others])) from None
     return status.summary_of(

@@ -17,11 +17,11 @@ import tomlkit
 import tomlkit.items
 
 from sweep.declaration import Declared, TablesError, check_table
+from sweep.errors import MAX_FAULTS, PipelineError
 from sweep.experiment import grid, parameters
 from sweep.experiment.draws import SAMPLINGS
 from sweep.experiment.grid import TRIAL, Axis, Grid
-from sweep.experiment.parameters import PARAMETERS, Parameter
-from sweep.messages import MAX_FAULTS, plain, refusal, shown, similar
+from sweep.messages import plain, shown, similar
 from sweep.model.image_file import read_regular
 from sweep.plugins.loading import DeclaredPlugin
 
@@ -49,7 +49,7 @@ def refusing(source: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise refusal([f"{source}: {line}" for line in str(error).split("\n")]) from None
+        raise PipelineError([f"{source}: {line}" for line in str(error).split("\n")]) from None
 
 
 def file_text(path: str | os.PathLike[str], most: int = MAX_BYTES) -> str:
@@ -200,7 +200,7 @@ HEADER = {
 }
 
 
-def section_of(name: str, known: Mapping[str, Parameter] = PARAMETERS) -> str:
+def section_of(name: str, known: Mapping[str, parameters.Parameter] = parameters.PARAMETERS) -> str:
     """Return the section that a parameter belongs under; empty for an unknown name."""
     if name == TRIAL:
         return "axes"

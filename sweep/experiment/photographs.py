@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.declaration import Declared, check_table, declared_fields
-from sweep.errors import PluginError
+from sweep.errors import PipelineError, PluginError
 from sweep.experiment.document import file_text, read_document, refusing
 from sweep.measure.flags import DetectionStatus, TruthSource
 from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbours
-from sweep.messages import plain, refusal, shown
+from sweep.messages import plain, shown
 from sweep.model.board import Board
 from sweep.model.board_kinds import KINDS
 from sweep.model.camera import Column
@@ -85,7 +85,7 @@ def board_of(document: Mapping[str, Any], source: str) -> Board:
     if not faults and not made.board().is_flat:
         faults = ["markers: expected one plane, for photographs: no z_m, no tilt_deg"]
     if faults:
-        raise refusal([f"{source}: {fault}" for fault in faults])
+        raise PipelineError([f"{source}: {fault}" for fault in faults])
     return made.board()
 
 

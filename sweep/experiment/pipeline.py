@@ -16,7 +16,7 @@ from typing import Any
 import tomlkit
 
 from sweep.declaration import Declared
-from sweep.errors import PluginError, path_of, texts_of
+from sweep.errors import MAX_FAULTS, PipelineError, PluginError, path_of, texts_of
 from sweep.experiment import document as documents
 from sweep.experiment import parameters
 from sweep.experiment.document import HEADER, REQUIRE, SEARCH, Reading
@@ -30,7 +30,7 @@ from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.measure.detectors import OPENCV
 from sweep.measure.estimators import SOLVERS
 from sweep.measure.flags import Ambiguous, BoundStatus, DetectionStatus, EstimateStatus, Flipped
-from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal, shown
+from sweep.messages import label, nearest, plain, shown
 from sweep.model import marker
 from sweep.model.board_kinds import ARRANGING, NEEDED, SINGLE, arrangement_faults, is_solid, used_by
 from sweep.model.calibration import MAX_BYTES, CalibrationError, calibration_of, read_tree
@@ -572,7 +572,7 @@ def _assigned(
                        if each in chosen and option == "--at"]
             chosen |= values
     if faults:
-        raise refusal(faults)
+        raise PipelineError(faults)
     return chosen
 
 
@@ -841,7 +841,7 @@ def _checked(
     for rule in RULES:
         rule(reading)
     if reading.faults:
-        raise refusal([*reading.faults])
+        raise PipelineError([*reading.faults])
     if chosen or reading.stated:
         # Comments stay. A text that is refused never comes here: tomlkit is slow.
         written: Any = tomlkit.parse(text)

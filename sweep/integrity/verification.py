@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.errors import ArgumentError, RunError, StoreError, SweepError
+from sweep.errors import ArgumentError, PipelineError, RunError, StoreError, SweepError
 from sweep.evaluation import results
 from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
 from sweep.evaluation.results import CellsResult, Failure, compare, is_same, to_dataset_layout
@@ -27,7 +27,7 @@ from sweep.isolation.child_process import Child, ChildError
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.detectors import OPENCV, PluginSetting
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.messages import nearest, plain, refusal
+from sweep.messages import nearest, plain
 from sweep.sampling.rules import scenes_needed
 from sweep.store import blocks, files, lifecycle
 from sweep.store.blocks import Receipt, RunStore
@@ -558,7 +558,7 @@ def _index(pipeline: Pipeline, at: str) -> dict[str, int]:
             faults.append(f"--at {name}={plain(value)}: not on the grid; its values are "
                           f"{excerpt(axis.values)}")
     if faults:
-        raise refusal(faults)
+        raise PipelineError(faults)
     return index
 
 

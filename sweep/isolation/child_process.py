@@ -53,9 +53,6 @@ GRACE_S = 600.0
 #: How often a child looks whether its caller still lives.
 PARENT_S = 1.0
 
-#: The module that computes scenes and blocks, which most calls need.
-BLOCK_TASK = "sweep.execution.block_task"
-
 
 class ChildError(Exception):
     """A call in a child process has no result: it raised (the message is the traceback), or died.
@@ -105,7 +102,8 @@ class Child(contextlib.AbstractContextManager["Child"]):
     Parameters
     ----------
     module
-        Imported by the child while it waits for the first call; its ``warm_up()`` is called.
+        Imported by the child while it waits for the first call; its ``warm_up()`` is called. By
+        default the one that computes scenes and blocks, which most calls need.
 
     Examples
     --------
@@ -114,7 +112,7 @@ class Child(contextlib.AbstractContextManager["Child"]):
     1024
     """
 
-    def __init__(self, module: str = BLOCK_TASK) -> None:
+    def __init__(self, module: str = "sweep.execution.block_task") -> None:
         self._module = module
         self._closing = threading.Lock()
         self._start()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.errors import local_fault
 from sweep.evaluation.block import run_cells, warm_up
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.results import CellsResult, Failure
@@ -17,7 +18,6 @@ from sweep.evaluation.variables import WITHOUT_DETECTION
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import GRACE_S, Child, ChildDiedError, ChildError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.messages import local_fault
 from sweep.store.blocks import selected
 from sweep.typing import Masks
 

@@ -24,7 +24,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import rotation_difference
 from sweep.measure.flags import TruthSource
 from sweep.measure.solver import both_planar_solutions, marker_frame, reprojection_errors_px
-from sweep.messages import notice, plain, refusal, shown
+from sweep.messages import notice, plain, shown
 from sweep.model.board import Board
 from sweep.model.calibration import VIEW, Calibration
 from sweep.model.image_file import Part
@@ -447,7 +447,7 @@ def poses_of_file(side: Side, path: Path) -> list[str]:
     record, faults = side.record, []
     names = {Path(each).stem: k for k, each in enumerate(record.paths)}
     if len(names) < len(record.paths):
-        raise refusal([f"{plain(path)}: expected photographs of different names without suffixes"])
+        raise PipelineError([f"{plain(path)}: expected images of different names without suffixes"])
     try:
         answers = read_answers(path, names, Conventions())
     except PipelineError as error:
@@ -471,7 +471,7 @@ def poses_of_file(side: Side, path: Path) -> list[str]:
                 "the marker's frame (x right, y up) to the camera's (x right, y down, z forward)"
             )
     if faults:
-        raise refusal([f"{plain(path)}: {fault}" for fault in faults])
+        raise PipelineError([f"{plain(path)}: {fault}" for fault in faults])
     given = np.nonzero(record.shown)
     cut = ~side.are_within(side.images(given))
     record.translation[given[0][cut], given[1][cut]] = np.nan

@@ -15,12 +15,12 @@ from sweep.analysis import requirements as decisions
 from sweep.analysis.dataset import ERROR_INPUTS, ESTIMATE_INPUTS
 from sweep.analysis.estimator import draws_to_see
 from sweep.analysis.requirements import Decision, ErrorShares, Requirable, Requirement
+from sweep.errors import PipelineError
 from sweep.experiment.document import SEARCH
 from sweep.experiment.grid import TRIAL, Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import CHOICES, MAX_TRIALS, StoppingRule
 from sweep.experiment.schema import LABELS, VARIABLES
-from sweep.messages import refusal
 from sweep.sampling.rules import Stopping
 from sweep.typing import Masks
 
@@ -273,4 +273,4 @@ def _check_trials(
              f"{least:,}: {why}" for draws, why in needed
              if (least := math.ceil(draws / pooled)) > rule.max_trials]
     if lines:
-        raise refusal(lines)
+        raise PipelineError(lines)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
-from sweep.errors import StoreError, StoreReplacedError
+from sweep.errors import StoreError
 from sweep.experiment.grid import Block, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline, selection_text
@@ -27,6 +27,11 @@ from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.flags import DetectionStatus
 from sweep.store import files
 from sweep.store.locations import is_remote, remote_run_id, translate_errors
+
+
+class StoreReplacedError(StoreError):
+    """A store that was moved, deleted or replaced by another run's while a run wrote it."""
+
 
 # --------------------------------------------------------------------------------------------------
 # An open store: where it lies, the pipeline that it belongs to, its arrays and its metadata.

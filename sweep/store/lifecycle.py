@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 from zarr.abc.store import Store
 from zarr.storage import MemoryStore
 
-from sweep.errors import ArgumentError, StoreError, path_of
+from sweep.errors import ArgumentError, PipelineError, StoreError, path_of
 from sweep.experiment import schema
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.experiment.pipeline import Pipeline
-from sweep.messages import plain, refusal
+from sweep.messages import plain
 from sweep.model.image_file import IMAGE_SUFFIXES
 from sweep.plugins.loading import RECORDED, recorded_plugins
 from sweep.store import blocks, files, locations
@@ -689,7 +689,7 @@ def read_pipeline(
             return Pipeline.from_toml(url, settings)
         if "://" not in url and not (Path(url) / "zarr.json").exists():
             name = plain(url) or repr(url)
-            raise refusal([f"{name}: a folder that is no store; expected a TOML file or a store"])
+            raise PipelineError([f"{name}: a folder, not a store; expected a TOML file or a store"])
         source = open_store(url).pipeline
     return Pipeline.from_text(
         source.text, settings, name=source.name, source=source.source, folder=source.folder)

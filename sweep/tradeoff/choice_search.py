@@ -15,7 +15,7 @@ import numpy as np
 
 from sweep.analysis.dataset import DRAWS, computed_scenes
 from sweep.analysis.requirements import Answer, Decision, answers
-from sweep.errors import check_positive
+from sweep.errors import PipelineError, check_positive
 from sweep.execution.progress import RunOptions, StageReport, stage_display, taking_run_options
 from sweep.execution.runner import execute
 from sweep.experiment.document import SEARCH
@@ -23,7 +23,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import CHOICES, StoppingRule
 from sweep.isolation.child_process import Interrupts
-from sweep.messages import notice, refusal
+from sweep.messages import notice
 from sweep.sampling.searches import choice_shares, product_of
 from sweep.store.lifecycle import open_dataset, read_pipeline, store_of
 from sweep.tradeoff.costs import measure, median_interval, sample_scenes
@@ -252,7 +252,7 @@ def size(
     rule = read.stopping
     if rule is None or rule.kind not in CHOICES:
         example = 'smallest = "size_m", max_trials = 5000'
-        raise refusal([f"{read.source}: expected what is chosen: [{SEARCH}] {example}"])
+        raise PipelineError([f"{read.source}: expected what is chosen: [{SEARCH}] {example}"])
     summary = execute(read, store_of(pipeline, store), **options)
     results = open_dataset(summary.store)
     found = tuple(answers(results, rule, choice_shares(read, rule)))

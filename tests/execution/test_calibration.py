@@ -88,7 +88,7 @@ def test_no_grid_of_a_billion_poses_makes_more_blocks_and_files_than_a_disk_can_
     blocks = forecast.blocks_of(pipeline, scene_s, 64)
     assert len(blocks) <= forecast.MAX_BLOCKS
     timing = forecast.Timing(scene_s, 1)
-    assert forecast.forecast_of(".", pipeline, timing, blocks, 64).files <= 3_000_000
+    assert forecast.forecast_of(".", pipeline, timing, blocks, 64, len(blocks)).files <= 3_000_000
     assert math.prod(blocks.extents) < 2.5 * math.prod(lengths) / forecast.MAX_BLOCKS
 
 

@@ -24,7 +24,7 @@ from support.clusters import local_cluster
 from support.commands import started
 from support.here import Here
 from support.stores import by_hand, same
-from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreReplacedError
+from sweep.errors import ArgumentError, MachineFaultError, RunError
 from sweep.execution import executors, on_cluster
 from sweep.execution.block_task import other_here
 from sweep.execution.executors import Children
@@ -32,6 +32,7 @@ from sweep.execution.on_cluster import OnCluster, connected
 from sweep.execution.runner import compute, execute
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, Interrupts
+from sweep.store.blocks import StoreReplacedError
 from sweep.store.lifecycle import create_store, open_store
 
 PIPELINE = Pipeline.from_text(

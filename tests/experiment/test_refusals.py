@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sweep.cli import main
-from sweep.errors import PipelineError
+from sweep.errors import MAX_FAULTS, PipelineError
 from sweep.experiment.photographs import read_board
 from sweep.experiment.pipeline import Pipeline, cell
-from sweep.messages import MAX_FAULTS, MAX_LINE_LENGTH
+from sweep.messages import MAX_LINE_LENGTH
 
 P = "[pose]\ndistance_m = 1\n"
 AXES = P + "jitter_px = 1\n[axes]\n"

@@ -75,7 +75,7 @@ def deciding(whitened, photograph):
 
 def print_divergences(found):
     """Print the divergence of all errors and of halves by distance and angle, and the verdict."""
-    found = found.isel(pose=np.isfinite(found["squared_error"].values))
+    found = found.dropna("pose", subset=["whitened"])
     distance = np.linalg.norm(found["tvec_m"], axis=1)
     angle = viewing_angle_of(found["rvec"].values, found["tvec_m"].values)
     bins = {"all": np.ones(len(distance), bool)}
@@ -110,7 +110,7 @@ def main(path, scene, repeats="8"):
             each.append(said.assign(photograph=("pose", np.full(said.sizes["pose"], k))))
     for name, part in parts.items():
         found = xr.concat(part, "pose")
-        squares = found["whitened"].values[np.isfinite(found["squared_error"].values)] ** 2
+        squares = found["whitened"].dropna("pose").values ** 2
         print(f"{name}: of {found.sizes['pose']} solved poses {found.known.values.sum()} known, "
               f"{found.flipped.values.sum()} flipped; mean squared errors along and about the tilt,"
               f" across and the line of sight {np.round(squares.mean(axis=0), 2)} of 1")

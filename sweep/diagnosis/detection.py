@@ -8,7 +8,6 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -123,11 +122,10 @@ class DetectionModel:
         known = (np.abs(np.hstack([rvec, tvec])) < MOST).all(axis=1) & (tvec[:, 2] > 0)
         known &= (ratio >= 0) & (ratio <= max(1.0, math.exp(self.ambiguity_knots[-1])))
         rvec, tvec = (np.where(known[:, None], each, [0.0, 0.0, 1.0]) for each in (rvec, tvec))
-        ratio = np.where(known, ratio, middle)
-        turn, at = frames(rvec, tvec), _conditions(rvec, tvec, self.focal_size_px_m)
-        basis = hat_basis(at, [self.side_knots, self.angle_knots])
+        turn, at = frames(rvec, tvec), _conditions(rvec, tvec, ratio, self.focal_size_px_m)
+        basis = hat_basis(at[:, 1:], [self.side_knots, self.angle_knots])
         first, last = ([self.side_knots[k], self.angle_knots[k]] for k in (0, -1))
-        known &= ((at >= first) & (at <= last)).all(axis=1)
+        known &= ((at[:, 1:] >= first) & (at[:, 1:] <= last)).all(axis=1)
         known &= bearing_of(tvec) <= self.max_bearing_deg
         known &= ((basis > 0) <= (self.poses >= MIN_AT_KNOT)).all(axis=1)
         covariance = turn @ _of_symmetric(
@@ -135,14 +133,12 @@ class DetectionModel:
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         bias = np.einsum("nij,nj->ni", turn, basis @ self.bias)
         bias += self.shift * _lengths(tvec[:, 2])
-        odds = _flip_basis(at, ratio, self.flip_knots) @ self.flips
-        for values in (covariance, bias, odds):
-            values[~known] = np.nan
+        odds = hat_basis(at, self.flip_knots) @ self.flips
         return xr.Dataset({
             "covariance": (("pose", "row", "column"), covariance, {"units": "m2, m rad, rad2"}),
             "bias": (("pose", "row"), bias, {"units": "m, radian"}),
             "flip_probability": ("pose", 1.0 / (1.0 + np.exp(-odds)), {"units": "1"}),
-            "known": ("pose", known)})
+        }).where(xr.DataArray(known, dims="pose")).assign(known=("pose", known))
 
     @property
     def flip_knots(self) -> list[Floats]:
@@ -156,9 +152,8 @@ class DetectionModel:
     @classmethod
     def from_json(cls, text: str) -> DetectionModel:
         """Return the model of `to_json`."""
-        values: dict[str, Any] = {
-            name: np.array(value)[()] for name, value in json.loads(text).items()}
-        return cls(**values)
+        return cls(**json.loads(text, object_hook=lambda attributes: {
+            name: np.array(value)[()] for name, value in attributes.items()}))
 
 
 def error_model(
@@ -174,8 +169,9 @@ def error_model(
         of `open`, of which one setting was chosen with ``.isel``.
     photographs
         A store of `photos` with the same setting and solver, or its results: six factors along and
-        about the line of sight, the tilt and across widen the covariance, so that it describes
-        their errors. Judge it on others.
+        about the line of sight, the tilt and across widen the covariance, and the errors are
+        correlated as far as photographs agree on it, so that it describes them. One photograph
+        shows no correlation; NaN errors are not counted. Judge it on others.
 
     Returns
     -------
@@ -211,17 +207,33 @@ def _opened(store: xr.Dataset | str | os.PathLike[str]) -> xr.Dataset:
 
 
 def widened(model: DetectionModel, photographs: xr.Dataset) -> DetectionModel:
-    """Return a model whose covariance times six factors describes the errors in photographs."""
-    for _ in range(ROUNDS):  # the truth's own errors are not multiplied
-        whitened = judged(model, photographs)["whitened"].values
-        squares = whitened[np.isfinite(whitened[:, 0])] ** 2
-        if len(squares) < MIN_PHOTOGRAPHED:
+    """Return a model whose covariance is stretched to the errors in photographs.
+
+    Six factors make the variances of the whitened errors 1. Then these are correlated: 1 - s of
+    each correlation r is kept, with the share s = sum Var(r) / sum r^2, at most 1, that has the
+    least expected squared error (Schäfer and Strimmer, "A shrinkage approach to large-scale
+    covariance matrix estimation and implications for functional genomics", Stat. Appl. Genet. Mol.
+    Biol. 4:32, 2005, target D). Errors within a photograph are not independent: r is a sum of one
+    number for each photograph, and Var(r) the sum of their squares, about 0 and not about their
+    mean. Of n photographs this adds about (1 - s) / n to the paper's share. It is 1 of a single
+    one, where the paper's is not defined, and of a few no correlations are invented.
+    """
+    for rounds_left in reversed(range(ROUNDS)):  # the truth's own errors are not multiplied
+        found = judged(model, photographs).dropna("pose", subset=["whitened"])
+        whitened = found["whitened"]
+        if len(whitened) < MIN_PHOTOGRAPHED:
             raise DatasetError(
-                f"{len(squares)} solved poses of photographs that are not flipped and that the "
+                f"{len(whitened)} solved poses of photographs that are not flipped and that the "
                 f"simulation knows: factors need {MIN_PHOTOGRAPHED} or more; take more "
                 "photographs, or simulate their poses (`sweep.twins`)")
-        model = dataclasses.replace(model, log_covariance=_stretched(
-            model.log_covariance, np.diag(squares.mean(axis=0))))
+        pairs = whitened * whitened.rename(row="column")
+        products = pairs.groupby(found["trial"]).sum().values
+        off_diagonal = products * (1.0 - np.eye(6))
+        share = (off_diagonal**2).sum() / (off_diagonal.sum(axis=0) ** 2).sum()
+        kept = 0.0 if rounds_left else max(1.0 - share, 0.0)
+        moments = products.sum(axis=0) / len(whitened) * np.where(np.eye(6), 1.0, kept)
+        model = dataclasses.replace(
+            model, log_covariance=_stretched(model.log_covariance, moments))
     return model
 
 
@@ -231,32 +243,28 @@ def judged(model: DetectionModel, results: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xr.Dataset
-        As `DetectionModel.at`, and ``rvec``, ``tvec_m`` (pose, xyz): the estimates; ``error``
-        (pose, row): estimated minus true, less the bias; ``truth_std`` (pose, row), 0 where it is
-        not known; ``flipped``; ``whitened`` (pose, row): errors in the frame of `frames`, divided
-        by the root of the sum of both covariances, uncorrelated with variance 1 where these are
-        right, NaN of flipped poses and where nothing is known; ``squared_error``: the sum of their
-        squares, 6 on average.
+        As `estimated`, but ``error`` is less the bias, and as `DetectionModel.at`; ``whitened``
+        (pose, row): errors in the frame of `frames`, divided by the root of the sum of both
+        covariances, uncorrelated with variance 1 where these are right, so that the sum of their
+        squares is 6 on average; NaN of flipped poses and where nothing is known.
     """
-    errors, rvec, tvec, ratio, flipped, deviations = estimated(results)
-    found = model.at(rvec, tvec, ratio)
-    errors = errors - found["bias"].values
-    whitened = np.full(errors.shape, np.nan)
-    used = found["known"].values & ~flipped
-    back = np.linalg.inv(frames(rvec, tvec)[used])
-    both = found["covariance"].values[used] + np.eye(6) * deviations[used, None] ** 2
-    whitened[used] = _whitened(
-        np.einsum("nij,nj->ni", back, errors[used]), back @ both @ back.transpose(0, 2, 1))
-    return found.assign(
-        rvec=(("pose", "xyz"), rvec), tvec_m=(("pose", "xyz"), tvec), flipped=("pose", flipped),
-        error=(("pose", "row"), errors), truth_std=(("pose", "row"), deviations),
-        whitened=(("pose", "row"), whitened),
-        squared_error=("pose", (whitened**2).sum(axis=1)))
+    found = estimated(results)
+    found = found.assign(model.at(found["rvec"], found["tvec_m"], found["ambiguity"]))
+    found["error"] = found["error"] - found["bias"]
+    used = found.isel(pose=(found["known"] & ~found["flipped"]).values)
+    back = np.linalg.inv(frames(used["rvec"].values, used["tvec_m"].values))
+    both = used["covariance"].values + np.eye(6) * used["truth_std"].values[:, None] ** 2
+    whitened = _whitened(np.einsum("nij,nj->ni", back, used["error"].values),
+                         back @ both @ back.transpose(0, 2, 1))
+    # By the numbers of the poses: NaN of those that are not used.
+    return found.assign(whitened=used["error"].copy(data=whitened))
 
 
 def of_simulation(results: xr.Dataset) -> DetectionModel:
     """Return the model of a simulation's poses."""
-    errors, rvec, tvec, ratio, flipped, _ = estimated(results)
+    found = estimated(results)
+    errors, rvec, tvec, ratio, flipped = (
+        found[name].values for name in ("error", "rvec", "tvec_m", "ambiguity", "flipped"))
     count = min(len(np.unique(errors[~flipped], axis=0)), int((ratio > 0).sum()))
     if len(tvec) < MIN_POSES or count < MIN_POSES / 2:
         raise DatasetError(f"{len(tvec):,} solved poses, of which {count:,} are not flipped, "
@@ -266,7 +274,7 @@ def of_simulation(results: xr.Dataset) -> DetectionModel:
     focal_size = float(focal_sizes.mean())
     if not np.allclose(focal_sizes, focal_size, rtol=1e-3):
         raise DatasetError("several focal lengths or sizes of the marker: expected a model of each")
-    at = _conditions(rvec, tvec, focal_size)
+    at = _conditions(rvec, tvec, ratio, focal_size)
     # Across the line of sight, where errors are small: those along it would hide the shift.
     across = sight_rotation(tvec).transpose(0, 2, 1)[:, :2]
     moved = np.linalg.solve(across[:, :, :2] * tvec[:, 2, None, None],
@@ -274,11 +282,11 @@ def of_simulation(results: xr.Dataset) -> DetectionModel:
     shift = np.zeros(6)
     shift[[0, 1, 3, 4]] = np.median(
         np.concatenate([moved, errors[:, 3:5]], axis=1)[~flipped], axis=0)
-    side, angle = (np.quantile(at[:, k], np.linspace(0.0, 1.0, KNOTS[k])) for k in (0, 1))
+    side, angle = (np.quantile(at[:, 1 + k], np.linspace(0.0, 1.0, KNOTS[k])) for k in (0, 1))
     angle[0] = 0.0 if angle[0] < FRONTAL_DEG else angle[0]
     errors = errors - shift * _lengths(tvec[:, 2])
     errors = np.einsum("nij,nj->ni", np.linalg.inv(frames(rvec, tvec)), errors)[~flipped]
-    basis = hat_basis(at[~flipped], [side, angle])
+    basis = hat_basis(at[~flipped, 1:], [side, angle])
     poses = basis.sum(axis=0)
 
     def means(values: Floats) -> Floats:
@@ -303,19 +311,24 @@ def of_simulation(results: xr.Dataset) -> DetectionModel:
     # add 1 / n. Heavy tails are worth fewer normal poses: n over Mardia's kurtosis / 48.
     tails = max(float(((whitened**2).sum(axis=1) ** 2).mean()) / 48.0, 1.0)
     wider = np.log((poses + tails) / np.maximum(poses - 7.0 * tails, 0.5 * poses + 1.0))
-    ambiguity = np.quantile(np.log(ratio[ratio > 0]), AMBIGUITY_SHARES)
+    ambiguity = np.quantile(at[ratio > 0, 0], AMBIGUITY_SHARES)
     model = DetectionModel(
         focal_size, side, angle, ambiguity, shift, bias,
         log_covariance + wider[:, None, None] * np.eye(6), poses, np.zeros(0),
         float(bearing_of(tvec).max()))
-    return dataclasses.replace(model, flips=_flip_fit(at, ratio, flipped, model.flip_knots))
+    return dataclasses.replace(model, flips=_flip_fit(at, flipped, model.flip_knots))
 
 
-def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Masks, Floats]:
-    """Return errors (n, 6) of solved poses, estimates, ambiguity, flips, and errors of the truth.
+def estimated(results: xr.Dataset) -> xr.Dataset:
+    """Return the solved poses of a dataset with their errors.
 
-    Errors are along and about the camera's axes, in metres and radians; the truth's standard
-    deviations (n, 6) are 0 where they are not known.
+    Returns
+    -------
+    xr.Dataset
+        ``error`` (pose, row): estimated minus true, along and about the camera's axes, in metres
+        and radians; ``truth_std`` (pose, row): the truth's standard deviations, 0 where they are
+        not known; ``rvec``, ``tvec_m`` (pose, xyz): the estimates; ``ambiguity``, 0 of a solver
+        that returns one solution alone; ``flipped``; ``trial``: places in the dataset.
 
     Raises
     ------
@@ -327,8 +340,9 @@ def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Mask
     names = [*vectors, *numbers, "estimate"]
     if missing := [name for name in names if name not in results]:
         raise DatasetError(f"no variable {missing[0]}: expected a run that solves poses")
-    if results["true_tvec_m"].ndim == 1:
+    if "trial" not in results.dims:
         results = results.expand_dims("trial")
+    results = results.assign_coords(trial=np.arange(results.sizes["trial"]))
     scene, dims = results["true_tvec_m"].dims, results["estimate"].dims
     if several := [f"{name} ({results.sizes[name]})" for name in dims
                    if name not in scene and results.sizes[name] > 1]:
@@ -337,17 +351,21 @@ def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Mask
     table = results[names + ["truth_std"] * ("truth_std" in results)].isel(
         dict.fromkeys(set(dims) - set(scene), 0), drop=True).load().stack(
         pose=[dim for dim in scene if dim != "xyz"], create_index=False).transpose("pose", ...)
-    table = table.isel(pose=(table["estimate"] == EstimateStatus.solved).values)
+    solved = (table["estimate"] == EstimateStatus.solved).values
+    table = table.isel(pose=solved).dropna("pose", subset=vectors)
     rvec, tvec, rotation, position = (table[name].values.astype(np.float64) for name in vectors)
     chosen, other, flipped = (table[name].values for name in numbers)
-    deviations = np.zeros((len(tvec), 6))
-    if "truth_std" in table:  # rotation, then position
-        deviations[:] = np.nan_to_num(table["truth_std"].values[:, [3, 4, 5, 0, 1, 2]])
-    known = np.isfinite(other) & (other > 0)  # a solver may return one solution alone
-    ratio = np.divide(chosen, other, out=np.zeros(len(other)), where=known)
+    # Of the rotation, then of the position.
+    deviations = np.asarray(table.get("truth_std", np.zeros((len(tvec), 6))), np.float64)
+    # A solver may return one solution alone: the other error is NaN.
+    ratio = np.divide(chosen, other, out=np.zeros(len(other)), where=other > 0)
     turned = vector_of_rotation(rotation_of_vector(rotation) @ rotation_of_vector(rvec))
-    return (np.concatenate([position, rotation], axis=1), turned, tvec + position, ratio,
-            flipped == Flipped.flipped, deviations)
+    return xr.Dataset({
+        "error": (("pose", "row"), np.concatenate([position, rotation], axis=1)),
+        "truth_std": (("pose", "row"), np.nan_to_num(deviations[:, [3, 4, 5, 0, 1, 2]])),
+        "rvec": (("pose", "xyz"), turned), "tvec_m": (("pose", "xyz"), tvec + position),
+        "ambiguity": ("pose", ratio), "flipped": ("pose", flipped == Flipped.flipped),
+        "trial": table["trial"].variable, "pose": np.arange(len(tvec))})
 
 
 def frames(rvec: Floats, tvec: Floats) -> Floats:
@@ -370,9 +388,10 @@ def _lengths(length: Floats) -> Floats:
     return np.repeat([length, np.ones(len(length))], 3, axis=0).T
 
 
-def _conditions(rvec: Floats, tvec: Floats, focal_size: float) -> Floats:
-    """Return ln(side) and viewing angle (n, 2) of estimates."""
-    return np.stack([np.log(focal_size / tvec[:, 2]), viewing_angle_of(rvec, tvec)], axis=-1)
+def _conditions(rvec: Floats, tvec: Floats, ratio: Floats, focal_size: float) -> Floats:
+    """Return ln(ambiguity), ln(side) and viewing angle (n, 3) of estimates."""
+    return np.stack([np.log(np.maximum(ratio, 1e-300)), np.log(focal_size / tvec[:, 2]),
+                     viewing_angle_of(rvec, tvec)], axis=-1)
 
 
 def _whitened(errors: Floats, covariance: Floats) -> Floats:
@@ -393,17 +412,11 @@ def _of_symmetric(matrices: Floats, function: Callable[[Floats], Floats]) -> Flo
     return np.asarray((vectors * function(values)[:, None, :]) @ vectors.transpose(0, 2, 1))
 
 
-def _flip_basis(at: Floats, ratio: Floats, knots: Sequence[Floats]) -> Floats:
-    """Return hat functions (n, knots) of ambiguity, side and viewing angle."""
-    return hat_basis(np.column_stack([np.log(np.maximum(ratio, 1e-300)), at]), knots)
-
-
-def _flip_fit(at: Floats, ratio: Floats, flipped: Masks, knots: Sequence[Floats]) -> Floats:
+def _flip_fit(at: Floats, flipped: Masks, knots: Sequence[Floats]) -> Floats:
     """Return the coefficients of a logistic regression, by iterated weighted least squares."""
-    basis = _flip_basis(at, ratio, knots)
+    basis = hat_basis(at, knots)
     ridge = RIDGE * differences(knots) + 1e-3 * np.eye(basis.shape[1])
-    share = (flipped.sum() + 0.5) / (len(flipped) + 1.0)
-    start = np.full(basis.shape[1], math.log(share / (1.0 - share)))
+    start = np.full(basis.shape[1], math.log((flipped.sum() + 0.5) / ((~flipped).sum() + 0.5)))
     found = start
     for _ in range(30):
         chance = 1.0 / (1.0 + np.exp(-(basis @ found)))

@@ -37,16 +37,6 @@ QUICK = {
 }
 
 
-class Sample:
-    """Estimated poses of half of the trials, with errors in the camera's frame."""
-
-    def __init__(self, results, half):
-        self.results = results.isel(trial=slice(half, None, 2)).load()
-        self.errors, self.rvec, self.tvec, self.ratio, self.flipped, _ = estimated(self.results)
-        self.distance = np.linalg.norm(self.tvec, axis=1)
-        self.angle = np.minimum(viewing_angle_of(self.rvec, self.tvec), 89.0)
-
-
 def divergence(w):
     """Return the divergence of the normal distribution of whitened errors from the expected one."""
     s = np.cov(w.T)
@@ -67,24 +57,23 @@ def sampling_divergence(w, repeats=50):
                     for _ in range(repeats)])
 
 
-def cells(sample, used):
+def cells(found):
     """Yield the poses of each cell of distance (quarters) and viewing angle."""
-    ends = np.quantile(sample.distance[used], np.linspace(0, 1, 5))
+    distance = np.linalg.norm(found["tvec_m"], axis=1)
+    angle = np.minimum(viewing_angle_of(found["rvec"].values, found["tvec_m"].values), 89.0)
+    ends = np.quantile(distance, np.linspace(0, 1, 5))
     for low, high in itertools.pairwise(ends):
         for first, last in itertools.pairwise(ANGLES_DEG):
-            inside = used & (sample.distance >= low) & (sample.distance <= high) & (
-                sample.angle >= first) & (sample.angle < last)
+            inside = (distance >= low) & (distance <= high) & (angle >= first) & (angle < last)
             if inside.sum() >= FEWEST:
                 yield inside
 
 
-def print_row(name, whitened, sample, used):
+def print_row(name, whitened, found):
     """Print the mean squared distance of whitened errors, and the divergence in all cells."""
-    full = np.full((len(used), whitened.shape[1]), np.nan)
-    full[used] = whitened
     divergences, chance = np.array([
-        (divergence(full[cell]), sampling_divergence(full[cell]))
-        for cell in cells(sample, used)]).T
+        (divergence(whitened[cell]), sampling_divergence(whitened[cell]))
+        for cell in cells(found)]).T
     row(name, f"{(whitened**2).sum(axis=1).mean():.2f} ({whitened.shape[1]})", *(
         f"{np.median(kl):.3f}, {kl.max():.3f}, {np.mean(kl <= 0.1):.0%} of {len(kl)}"
         for kl in (divergences, divergences - chance)))
@@ -118,26 +107,29 @@ def flip_bins(chance, flipped):
 def main():
     results = sweep.run(Pipeline.from_toml(DOCUMENT, SETTINGS), store="runs/detection.zarr")
     for refinement in REFINEMENTS:
-        chosen = results.sel(cornerRefinementMethod=refinement)
-        a, b = (Sample(chosen.drop_vars("cornerRefinementMethod"), half) for half in (0, 1))
-        found = error_model(a.results).at(b.rvec, b.tvec, b.ratio)
-        known = found["known"].values
-        used = known & ~b.flipped
-        left = (b.errors - found["bias"].values)[used]
+        chosen = results.sel(cornerRefinementMethod=refinement).drop_vars("cornerRefinementMethod")
+        even, odd = (chosen.isel(trial=slice(half, None, 2)).load() for half in (0, 1))
+        fitted, found = estimated(even), estimated(odd)
+        found = found.assign(error_model(even).at(found.rvec, found.tvec_m, found.ambiguity))
+        known, flipped, chance = (
+            found[name].values for name in ("known", "flipped", "flip_probability"))
+        used = found.isel(pose=known & ~flipped)
+        left = (used["error"] - used["bias"]).values
         print(f"\n{refinement}: {len(known):,} solved poses, {known.mean():.2%} known, "
-              f"{b.flipped.mean():.2%} flipped\n")
+              f"{flipped.mean():.2%} flipped\n")
         header("form", "mean squared error", "KL divergence of cells: median, worst, share within "
                "0.1", "without the part of sampling")
         for name, some in (("ours, all six", list(range(6))), ("ours, x, z, yaw", PLANE)):
-            root = np.linalg.cholesky(found["covariance"].values[used][:, some][:, :, some])
+            root = np.linalg.cholesky(used["covariance"].values[:, some][:, :, some])
             whitened = np.linalg.solve(root, left[:, some, None])[..., 0]
-            print_row(name, whitened, b, used)
+            print_row(name, whitened, used)
         for name, (form, factors) in FORMS.items():
-            fitted, judged = (
-                sample.errors[rows][:, PLANE] / form(sample.distance[rows, None])
-                for sample, rows in ((a, ~a.flipped), (b, used)))
+            fit, judged = (
+                each["error"].values[:, PLANE]
+                / form(np.linalg.norm(each["tvec_m"], axis=1, keepdims=True))
+                for each in (fitted.isel(pose=~fitted["flipped"].values), used))
             for each in factors:
-                judged[:, each] /= np.sqrt((fitted[:, each] ** 2).mean())
-            print_row(name, judged, b, used)
-        inside = list(flip_bins(found["flip_probability"].values[known], b.flipped[known]))
+                judged[:, each] /= np.sqrt((fit[:, each] ** 2).mean())
+            print_row(name, judged, used)
+        inside = list(flip_bins(chance[known], flipped[known]))
         print(f"\nflips within the interval in {sum(inside)} of {len(inside)} bins")

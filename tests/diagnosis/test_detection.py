@@ -10,7 +10,7 @@ from sweep.measure.flags import EstimateStatus, Flipped
 from sweep.model.pose import mirrored, rotation_of_angles, rotation_of_vector, vector_of_rotation
 
 
-def drawn(seed, count=6000):
+def drawn(seed, count=6000, noise=None):
     """Return a dataset of poses whose errors are normal, grow with 1 / side, and flip when far."""
     rng = np.random.default_rng(seed)
     z = np.exp(rng.uniform(0, np.log(4), count))
@@ -19,7 +19,7 @@ def drawn(seed, count=6000):
         rng.uniform(0, 60, count), rng.uniform(0, 360, count), rng.uniform(0, 360, count)]))
     side = 90.0 / z
     sd = np.array([2e-4, 2e-4, 1e-3, 2e-3, 2e-3, 1e-3]) * (90 / side)[:, None]
-    error = rng.normal(0, 1, (count, 6)) * sd
+    error = (rng.normal(0, 1, (count, 6)) if noise is None else noise) * sd
     error[:, 2] += 0.002
     error[:, 0] += 2.0 * error[:, 3] / 20
     ratio = rng.uniform(0.02, 1.0, count)
@@ -40,6 +40,15 @@ def drawn(seed, count=6000):
     }, {"side_px": ("trial", side)})
 
 
+def photographed(seed, correlation, count=1600):
+    """Return photographs of 20 markers, with twice the errors, of which 30 % are common to each."""
+    rng = np.random.default_rng([seed, 1])
+    noise = rng.normal(0, 1.7, (count, 6)) + rng.normal(0, 1.1, (count // 20, 6)).repeat(20, axis=0)
+    noise[:, 5] = correlation * noise[:, 2] + np.sqrt(1 - correlation**2) * noise[:, 5]
+    found = drawn(seed, count, noise).assign(truth_std=(("trial", "component"), 1e-4 + 0 * noise))
+    return found.coarsen(trial=20).construct(trial=("trial", "marker"))
+
+
 @pytest.fixture(scope="module")
 def model():
     return error_model(drawn(1))
@@ -49,24 +58,23 @@ def test_errors_of_other_draws_are_as_large_as_the_covariance_says(model):
     found = judged(model, drawn(2))
     known = found["known"].values
     chance, flipped = (found[name].values[known] for name in ("flip_probability", "flipped"))
-    assert 5.8 < found["squared_error"].mean() < 6.2
+    assert 5.8 < (found["whitened"] ** 2).sum("row").values[known & ~flipped].mean() < 6.2
     for bin_ in np.array_split(np.argsort(chance), 5):
         expected, spread = chance[bin_].sum(), np.sqrt((chance * (1 - chance))[bin_].sum())
         assert abs(flipped[bin_].sum() - expected) < 4 * spread + 3
 
 
-def test_a_factor_from_photographs_widens_the_covariance_to_their_errors(model):
-    photographs = drawn(3, 3000)
-    for name in ("rotation_error_rad", "translation_error_m"):
-        unflipped = photographs["flipped"] == Flipped.not_flipped
-        photographs[name] = photographs[name] * xr.where(unflipped, 2.0, 1.0)
-    photographs["truth_std"] = (("trial", "component"), np.full((3000, 6), 1e-4))
-    seen, others = photographs.isel(trial=slice(1500)), photographs.isel(trial=slice(1500, None))
-    assert judged(model, others)["squared_error"].mean() > 20
-    wider = error_model(drawn(1), seen)
-    assert 5.5 < judged(wider, others)["squared_error"].mean() < 6.5
+@pytest.mark.parametrize(("correlation", "gain", "error"), [(0.0, 0.0, 0.03), (0.5, 0.08, 0.05)])
+def test_photographs_widen_the_covariance_and_show_correlations(model, correlation, gain, error):
+    """20 gain 0.000 (sd of 40 sets 0.002) and 0.080 (0.008) over one; squares are 5.8 (0.35)."""
+    seen, others, left = photographed(2, correlation, 400), photographed(3, correlation), []
+    for photographs in (seen.stack(all=("trial", "marker"), create_index=False), seen):
+        whitened = judged(widened(model, photographs), others)["whitened"].dropna("pose")
+        assert 3.5 < (whitened**2).sum("row").mean() < 8.5
+        left.append((np.trace(s := np.cov(whitened.T)) - 6 - np.linalg.slogdet(s)[1]) / 2)
+    assert left[0] - left[1] == pytest.approx(gain, abs=error)
     with pytest.raises(DatasetError, match="take more photographs"):
-        widened(model, seen.isel(trial=slice(40)))
+        error_model(drawn(1), seen.isel(trial=slice(2)))
 
 
 @pytest.mark.parametrize(("change", "words"), [

@@ -101,6 +101,10 @@ class StoreError(SweepError):
     """A store that cannot be written, read or continued as asked."""
 
 
+class DamagedStoreError(StoreError):
+    """A store of which a file is missing or changed."""
+
+
 class DatasetError(StoreError):
     """A dataset that lacks what an analysis needs, or two that do not fit together.
 

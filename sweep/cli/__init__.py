@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 1
-    except (OSError, MemoryError, RuntimeError, ValueError) as error:
+    except (OSError, MemoryError, RuntimeError) as error:
         return command.print_system_error(error)
     finally:
         if arguments is None and "logging" in sys.modules:

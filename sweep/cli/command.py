@@ -12,14 +12,13 @@ import logging
 import os
 import re
 import sys
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from sweep import library
-from sweep.errors import ArgumentError, PipelineError, PluginError, StoreError, SweepError
+from sweep.errors import ArgumentError, DamagedStoreError, RunError, SweepError
 from sweep.messages import notice, plain, quoted
 
 if TYPE_CHECKING:
@@ -380,8 +379,8 @@ ADVICE = {
 #: Python's message in a RuntimeError where the system allows no more threads.
 NO_THREAD = "can't start new thread"
 
-#: Errors of a request (exit status 2); others occur while a command runs (1).
-REFUSALS = (ArgumentError, PipelineError, PluginError, StoreError)
+#: Errors that occur while a command runs (exit status 1); others are those of a request (2).
+FAILURES = (RunError, DamagedStoreError)
 
 
 def print_error(error: SweepError) -> int:
@@ -397,15 +396,11 @@ def print_error(error: SweepError) -> int:
         text = f"{flag}{given}: {error.problem}"
     for line in text.split("\n"):
         print(plain(line, MAX_LINE_LENGTH), file=sys.stderr)
-    return 2 if isinstance(error, REFUSALS) else 1
+    return 1 if isinstance(error, FAILURES) else 2
 
 
-def print_system_error(error: OSError | MemoryError | RuntimeError | ValueError) -> int:
-    """Print one line if the system refused something, or Zarr cannot decode a file of a store.
-
-    Any other RuntimeError or ValueError is a defect, and raised.
-    """
-    modules = [frame.f_globals["__name__"] for frame, _ in traceback.walk_tb(error.__traceback__)]
+def print_system_error(error: OSError | MemoryError | RuntimeError) -> int:
+    """Print one line if the system refused something; any other RuntimeError is a defect."""
     if isinstance(error, MemoryError):
         line, number = "out of memory", errno.ENOMEM
     elif isinstance(error, OSError):
@@ -413,8 +408,6 @@ def print_system_error(error: OSError | MemoryError | RuntimeError | ValueError)
         line, number = f"{cause}: {error.strerror or error}", error.errno or 0
     elif str(error) == NO_THREAD:
         line, number = f"the system refused a request: {error}", errno.EAGAIN
-    elif modules[-1].partition(".")[0] in ("zarr", "numcodecs"):
-        line, number = f"a store cannot be read: {error}; `sweep verify` names what is damaged", 0
     else:
         raise error
     advice = f"; {ADVICE[number]}" if number in ADVICE else ""

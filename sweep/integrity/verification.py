@@ -150,7 +150,7 @@ def check_blocks(
                 faults[key] = "missing"
             elif not files.is_sound(content) or (not isinstance(receipt, str) and (
                     files.checksum_of(content) != receipt.checksums.get(names[key]))):
-                faults[key] = lifecycle.CHANGED
+                faults[key] = files.CHANGED
             report.bytes += len(content or b"")
         report.files += 1 + len(names)
         report.damage += [Damage(key, what, number) for key, what in faults.items()]
@@ -362,7 +362,7 @@ def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:
     report.damage = [Damage(key, fault) for key, fault
                      in lifecycle.damaged_files(store, tables=True).items()]
     if not lifecycle.is_root_sound(store):
-        report.damage.append(Damage("zarr.json", lifecycle.CHANGED))
+        report.damage.append(Damage("zarr.json", files.CHANGED))
     numbers: Sequence[int] = range(len(store.blocks)) if report.finished else sorted(done)
     sound = check_blocks(store, numbers, report)
     if report.finished:

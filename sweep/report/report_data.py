@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -19,14 +18,14 @@ from sweep.analysis.comparisons import paired_tables
 from sweep.analysis.dataset import QUANTITIES, SIZE_AXES, is_grid_axis, of_photographs, sections_of
 from sweep.analysis.estimator import LEVEL
 from sweep.analysis.requirements import ANGLE_AXES, SIZES_BESIDE, conditions, parse_requirements
-from sweep.errors import StoreError, SweepError, texts_of
+from sweep.errors import texts_of
 from sweep.execution.status import Totals, account_of
 from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
 from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.report.table import Column, Table, Value, axis_label, column, draws_text, number
-from sweep.store.lifecycle import open_dataset, open_finished
+from sweep.store.lifecycle import check_files, open_dataset, open_finished
 from sweep.tradeoff import verdicts
 from sweep.tradeoff.pareto import WRONG, conditions_of, configuration_label
 from sweep.tradeoff.verdicts import BETTER, VERDICTS, WORSE, first_verdict, verdict
@@ -199,19 +198,6 @@ def course_of(data: ReportData) -> tuple[str | None, tuple[str, ...]]:
     return along, tuple(sorted(others, key=lambda name: name not in ANGLE_AXES))
 
 
-@contextlib.contextmanager
-def store_errors(store: str) -> Iterator[None]:
-    """Translate every error while a store is read into a ``StoreError`` of one line."""
-    try:
-        yield
-    except SweepError:
-        raise
-    except Exception as error:
-        # A damaged store fails within zarr, its codecs or xarray, each with errors of its own.
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise StoreError(f"{store}: cannot be read: {reason}") from None
-
-
 def read_report_data(
     url: str, require: Sequence[str] = (), per: Sequence[str] | None = None, command: str = ""
 ) -> ReportData:
@@ -236,12 +222,12 @@ def read_report_data(
     """
     store = open_finished(url)
     trade = None
-    with store_errors(store.url):
-        if "cost/tradeoff" in store.group:
-            trade = xr.open_zarr(
-                store.storage, group="cost/tradeoff", consolidated=False, zarr_format=3
-            ).load()
-        results = open_dataset(store.url, MAX_READ_BYTES)
+    if "cost/tradeoff/zarr.json" in store.run_metadata["files"]:
+        check_files(store, tables=True)
+        trade = xr.open_zarr(
+            store.group.store, group="cost/tradeoff", consolidated=False, zarr_format=3
+        ).load()
+    results = open_dataset(store.url, MAX_READ_BYTES)
     required = texts_of("require", require) or store.pipeline.requirements
     return ReportData(
         store.url, results, store.pipeline, store.run_metadata, trade,

@@ -579,8 +579,7 @@ def write_report(
         output_file.check_output_file(folder / "figure.png" if folder.is_dir() else folder)
     if data.results["estimate"].size == 0:
         raise StoreError(f"{data.store}: there are no results")
-    with report_data.store_errors(data.store):
-        found, drawn, scenes = answer(data), figures_of(data), scenes_of(data)
+    found, drawn, scenes = answer(data), figures_of(data), scenes_of(data)
     pictures = {
         f"{figure.name}{suffix}": panels_file(figure.panels, suffix)
         for figure in drawn for suffix in PICTURES if folders}

@@ -16,21 +16,61 @@ from typing import Any, cast
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.abc.store import Store
-from zarr.storage import LocalStore
+from zarr.abc.store import ByteRequest, Store
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import LocalStore, WrapperStore
 
-from sweep.errors import StoreError
+from sweep.errors import DamagedStoreError, StoreError
 from sweep.experiment.grid import Block, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.flags import DetectionStatus
+from sweep.messages import quoted
 from sweep.store import files
 from sweep.store.locations import is_remote, remote_run_id, translate_errors
 
 
 class StoreReplacedError(StoreError):
     """A store that was moved, deleted or replaced by another run's while a run wrote it."""
+
+
+# --------------------------------------------------------------------------------------------------
+# A store is damaged: a file is missing or changed. Each reader says so, and names store and file.
+
+def damaged(url: str, fault: str, remedy: str = "") -> DamagedStoreError:
+    """Return the error that names a store's fault, and the remedy: by default, its repair."""
+    repair = f"`{quoted('sweep', 'verify', url, '--repair')}` repairs it"
+    return DamagedStoreError(f"{url}: damaged: {fault}; {remedy or repair}")
+
+
+class CheckedReads(WrapperStore[Store]):
+    """The storage of a store for its readers: a chunk that does not fit its checksum is an error.
+
+    Zarr's own error names neither the store nor the chunk.
+    """
+
+    def __init__(self, store: Store, url: str) -> None:
+        super().__init__(store)
+        self._url = url
+
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """Return the content of a key.
+
+        Raises
+        ------
+        DamagedStoreError
+            If it is a chunk that was changed.
+        StoreError
+            If it cannot be read.
+        """
+        with translate_errors(self._url, "read"):
+            content = await self._store.get(key, prototype, byte_range)
+        if not (content is None or key.endswith("zarr.json") or files.is_sound(content.to_bytes())):
+            raise damaged(self._url, f"{key}: {files.CHANGED}")
+        return content
 
 
 # --------------------------------------------------------------------------------------------------
@@ -44,8 +84,10 @@ class RunStore:
     ----------
     url
         As the user gave it.
+    storage
+        The storage that holds the store's files.
     group
-        The root group.
+        The root group, whose chunks are checked when they are read.
     pipeline
         The experiment that the store was created for.
     run_id
@@ -55,16 +97,12 @@ class RunStore:
     """
 
     url: str
+    storage: Store
     group: zarr.Group
     pipeline: Pipeline
     run_id: str
     blocks: Blocks
     _arrays: dict[str, zarr.Array[Any]] = field(default_factory=dict, repr=False, compare=False)
-
-    @property
-    def storage(self) -> Store:
-        """The storage that holds the store's files."""
-        return self.group.store
 
     @functools.cached_property
     def variables(self) -> tuple[Variable, ...]:
@@ -394,10 +432,7 @@ def receipts(store: RunStore, numbers: Iterable[int]) -> Iterator[tuple[int, Rec
     """
     for number, receipt in receipts_or_faults(store, numbers):
         if isinstance(receipt, str):
-            raise StoreError(
-                f"{store.url}: the receipt of block {number} is damaged ({receipt}); "
-                "`sweep verify --repair` repairs it"
-            )
+            raise damaged(store.url, f"the receipt of block {number}: {receipt}")
         yield number, receipt
 
 
@@ -501,7 +536,5 @@ def check_whole(store: RunStore) -> set[int]:
     if not missing:
         return done
     examples = [f"{key} of block {number}" for number, key in sorted(missing.items())[:2]]
-    raise StoreError(
-        f"{store.url}: damaged: {len(missing):,} of {len(store.blocks):,} blocks lack chunks, such "
-        f"as {', '.join(examples)}; `sweep verify --repair` computes them again"
-    )
+    raise damaged(store.url, f"{len(missing):,} of {len(store.blocks):,} blocks lack chunks, such "
+                  f"as {', '.join(examples)}")

@@ -154,6 +154,9 @@ RECEIPTS = "commits/receipt"
 #: listing tells which chunks of a variable there are.
 SEPARATOR = "."
 
+#: The fault of a file.
+CHANGED = "changed: does not fit its checksum"
+
 #: Level of the compression of every chunk.
 ZSTD_LEVEL = 3
 
@@ -177,7 +180,7 @@ def packed(body: bytes) -> bytes:
 
 def is_sound(content: bytes) -> bool:
     """Return whether a chunk fits the checksum at its end."""
-    return bool(google_crc32c.value(content[:-4]) == checksum_of(content))
+    return len(content) > 4 and bool(google_crc32c.value(content[:-4]) == checksum_of(content))
 
 
 def unpacked(content: bytes) -> bytes:

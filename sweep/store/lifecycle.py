@@ -12,7 +12,7 @@ import uuid
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -22,13 +22,12 @@ from numpy.typing import NDArray
 from zarr.abc.store import Store
 from zarr.storage import MemoryStore
 
-from sweep.errors import ArgumentError, PipelineError, StoreError, path_of
+from sweep.errors import ArgumentError, StoreError, path_of
 from sweep.experiment import schema
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.experiment.pipeline import Pipeline
-from sweep.messages import plain
 from sweep.model.image_file import IMAGE_SUFFIXES
 from sweep.plugins.loading import RECORDED, recorded_plugins
 from sweep.store import blocks, files, locations
@@ -184,8 +183,6 @@ def _photographs(
 #: Groups that a finished store has.
 TABLES = ("cost",)
 
-CHANGED = "changed: does not fit its checksum"
-
 
 def checksums(contents: Mapping[str, bytes]) -> dict[str, int]:
     """Return the CRC-32 of files by key."""
@@ -201,10 +198,17 @@ def damaged_files(store: RunStore, *, tables: bool) -> dict[str, str]:
               if tables or key.partition("/")[0] not in TABLES}
     contents = files.read_files(store.storage, list(listed))
     return {
-        key: "missing" if content is None else CHANGED
+        key: "missing" if content is None else files.CHANGED
         for (key, crc), content in zip(listed.items(), contents, strict=True)
         if content is None or crc32(content) != crc
     }
+
+
+def check_files(store: RunStore, *, tables: bool) -> None:
+    """Raise DamagedStoreError if a listed file is missing or changed."""
+    for key, fault in damaged_files(store, tables=tables).items():
+        blocks.check_not_replaced(store)
+        raise blocks.damaged(store.url, f"{key}: {fault}")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -222,7 +226,7 @@ UNREADABLE = (
 NEW_RUN = "run its pipeline into a new store: `sweep run PIPELINE --store NEW`"
 
 
-def open_store(url: str, mode: str = "r") -> RunStore:
+def open_store(url: str, mode: Literal["r", "r+"] = "r") -> RunStore:
     """Open a store that :func:`create_store` made.
 
     Raises
@@ -231,15 +235,11 @@ def open_store(url: str, mode: str = "r") -> RunStore:
         If there is no store, or something else, or metadata or coordinates of it are damaged.
     """
     store = open_unchecked(url, mode)
-    # Tables may be written at this moment, and blocks do not need them.
-    for key, fault in damaged_files(store, tables=False).items():
-        blocks.check_not_replaced(store)
-        raise StoreError(
-            f"{store.url}: damaged: {key}: {fault}; `sweep verify --repair` repairs it")
+    check_files(store, tables=False)  # they may be written at this moment, and blocks need none
     return store
 
 
-def open_unchecked(url: str, mode: str = "r") -> RunStore:
+def open_unchecked(url: str, mode: Literal["r", "r+"] = "r") -> RunStore:
     """Open a store that may be damaged; StoreError if its pipeline is lost."""
     url = locations.checked_url(url)
     storage = locations.open_storage(url, mode)
@@ -251,7 +251,7 @@ def open_unchecked(url: str, mode: str = "r") -> RunStore:
                 f"{FORMAT} alone; {NEW_RUN}"
             )
         if attributes.get(CHECKSUM) != _checksum(attributes):
-            raise StoreError(f"{url}: damaged: zarr.json was changed; {NEW_RUN}")
+            raise blocks.damaged(url, "zarr.json was changed", NEW_RUN)
         pipeline = Pipeline.from_text(
             str(attributes["pipeline"]), name=metadata["name"],
             source=f"{url} (its pipeline)", folder=metadata["folder"],
@@ -260,8 +260,8 @@ def open_unchecked(url: str, mode: str = "r") -> RunStore:
         cut = Blocks(
             tuple(len(axis) for axis in pipeline.experiment.scene_axes), tuple(metadata["block"]))
         group = zarr.open_group(
-            storage, mode=mode, zarr_format=3, use_consolidated=False)  # type: ignore[arg-type]
-        return RunStore(url, group, pipeline, metadata["run_id"], cut)
+            blocks.CheckedReads(storage, url), mode=mode, zarr_format=3, use_consolidated=False)
+        return RunStore(url, storage, group, pipeline, metadata["run_id"], cut)
     except UNREADABLE:
         raise StoreError(locations.not_a_store(url)) from None
 
@@ -277,14 +277,12 @@ def read_root(url: str, storage: Store) -> tuple[dict[str, Any], dict[str, Any]]
         If it is not a store.
     """
     try:
-        return blocks.root_of(storage)
-    except PermissionError as error:
-        raise StoreError(f"{url}: cannot be read: {locations.reason_of(error)}") from None
+        with locations.translate_errors(url, "read"):
+            return blocks.root_of(storage)
     except UNREADABLE:
         if files.list_folder(storage, files.RECEIPTS):
-            raise StoreError(
-                f"{url}: damaged: without its zarr.json, its pipeline is lost; {NEW_RUN}"
-            ) from None
+            fault = "without its zarr.json, its pipeline is lost"
+            raise blocks.damaged(url, fault, NEW_RUN) from None
         raise StoreError(locations.not_a_store(url)) from None
 
 
@@ -465,25 +463,20 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
 
     done = blocks.check_whole(store)
     small = store.pipeline.experiment.bytes_of(math.prod(store.blocks.lengths)) <= read_bytes
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
-            dataset: xr.Dataset = xr.open_zarr(
-                store.storage, chunks=None if small else _together(store), consolidated=False,
-                zarr_format=3)
-            dataset = dataset.load() if small else dataset
-        # Columns of an axis are short and asked for one by one; much of xarray and pandas does not
-        # support NumPy's strings of variable length.
-        columns = {name for axis in store.pipeline.axes if axis.zipped for name in axis.columns}
-        loaded = {
-            name: (value.dims, value.to_numpy().astype(object) if value.dtype.kind == "T"
-                   else value.to_numpy(), value.attrs)
-            for name, value in dataset.coords.items() if value.dtype.kind == "T" or name in columns
-        }
-    except (*UNREADABLE, RuntimeError) as error:
-        reason = locations.reason_of(error)
-        raise StoreError(
-            f"{store.url}: damaged ({reason}); `sweep verify --repair` repairs it") from None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
+        dataset: xr.Dataset = xr.open_zarr(
+            store.group.store, chunks=None if small else _together(store), consolidated=False,
+            zarr_format=3)
+        dataset = dataset.load() if small else dataset
+    # Columns of an axis are short and asked for one by one; much of xarray and pandas does not
+    # support NumPy's strings of variable length.
+    columns = {name for axis in store.pipeline.axes if axis.zipped for name in axis.columns}
+    loaded = {
+        name: (value.dims, value.to_numpy().astype(object) if value.dtype.kind == "T"
+               else value.to_numpy(), value.attrs)
+        for name, value in dataset.coords.items() if value.dtype.kind == "T" or name in columns
+    }
     dataset = dataset.assign_coords(loaded)
     if len(done) < len(store.blocks):
         dataset = _only_committed(store, dataset, done)
@@ -621,7 +614,7 @@ def write_root(
 # --------------------------------------------------------------------------------------------------
 # A store that is finished: of another one, who writes it, or how to continue it.
 
-def open_finished(url: str, mode: str = "r") -> RunStore:
+def open_finished(url: str, mode: Literal["r", "r+"] = "r") -> RunStore:
     """Open a store.
 
     Raises
@@ -673,9 +666,9 @@ def read_pipeline(
     ArgumentError
         If the source is none of these.
     PipelineError
-        If the file or a setting is invalid, or a folder is no store.
+        If the file or a setting is invalid.
     StoreError
-        If the store cannot be read.
+        If a folder is no store, or the store cannot be read.
     """
     if isinstance(source, Mapping):
         return Pipeline.from_dict(source, settings)
@@ -687,9 +680,6 @@ def read_pipeline(
         url = os.fspath(source)
         if not names_store(url):
             return Pipeline.from_toml(url, settings)
-        if "://" not in url and not (Path(url) / "zarr.json").exists():
-            name = plain(url) or repr(url)
-            raise PipelineError([f"{name}: a folder, not a store; expected a TOML file or a store"])
         source = open_store(url).pipeline
     return Pipeline.from_text(
         source.text, settings, name=source.name, source=source.source, folder=source.folder)

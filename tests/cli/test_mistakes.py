@@ -44,7 +44,7 @@ def folder(stores, monkeypatch):
         ("runn small.toml", "did you mean run?"),
         ("run small.toml tilt_deg=3", "did you mean --set tilt_deg=3?"),
         ("plan small.toml --worker-count 2", "did you mean --workers?"),
-        ("run runs", "runs: a folder, not a store; expected a TOML file or a store"),
+        ("run runs", "runs: not a sweep store; choose another path"),
         ("show small.toml -o cell.jpg", "--output cell.jpg: expected a file that ends in .png"),
         ("repro runs/small.zarr --at side_px=31", "not on the grid; its values are 30.0, 60.0"),
         ("repro small.toml", "`sweep run small.toml` makes its store"),

@@ -2,6 +2,7 @@
 
 import itertools
 import pickle
+import re
 import shutil
 import threading
 from pathlib import Path
@@ -14,14 +15,14 @@ import zarr.storage._local as local
 import sweep
 from support.stores import by_hand, editable, same
 from sweep.cli import main
-from sweep.errors import StoreError
+from sweep.errors import DamagedStoreError, StoreError
 from sweep.evaluation.results import processor
 from sweep.execution.block_task import compute_block, match
 from sweep.execution.runner import execute
 from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA, VARIABLES
-from sweep.integrity.verification import reproduce, verify
+from sweep.integrity.verification import verify
 from sweep.measure.flags import EstimateStatus, present_values
 from sweep.store.blocks import check_whole, committed, drop_block, missing_chunks, receipts
 from sweep.store.lifecycle import create_store, open_store
@@ -174,22 +175,33 @@ def test_block_that_is_dropped_while_a_reader_looks_is_not_damaged(written, tmp_
     ("detection/c.0.*", "rotation_error_rad/c.1.0.1.*"), ("true_rvec/c.*",),
     ("commits/receipt/c.2",), ("tilt_deg/c.0.1",),
 ], ids=["parts", "a variable", "a receipt", "a drawn coordinate"])
-def test_readers_name_what_is_gone_and_what_repairs_it(lost, grid, copied, capsys):
+def test_readers_name_what_is_gone_and_what_repairs_it(lost, grid, copied):
     for path in itertools.chain(*map(copied.glob, lost)):
         path.unlink()
     name = lost[0].partition("/c")[0]
     for reader in (sweep.open, status, lambda url: match(grid, open_store(url))):
-        if name == "commits/receipt" and reader is not sweep.open:
-            continue
-        with pytest.raises(StoreError, match=rf"{name}/c\..* of block .*sweep verify --repair"):
+        with pytest.raises(DamagedStoreError, match=rf"{name}/c\..* of block .*zarr --repair"):
             reader(str(copied))
-    for command, *more in (["status"], ["require", "detection >= 0.1"]):
-        assert main([command, str(copied), *more]) == 2
-        assert "sweep verify --repair" in capsys.readouterr().err
     assert {damage.block for damage in verify(str(copied), 0).damage} <= set(range(4))
-    if name == "detection":
-        with pytest.raises(StoreError, match=r"detection/c\.0"):
-            reproduce(str(copied), ["side_px=30"])
+
+
+@pytest.mark.parametrize("share", [None, 0, 0.5], ids=["deleted", "emptied", "cut"])
+def test_each_reader_names_a_damaged_store_and_what_repairs_it(share, copied, monkeypatch, capsys):
+    monkeypatch.chdir(Path(shutil.copytree(copied, copied.with_name("good.zarr"))).parent)
+    for name in ("detection", "estimate", "rotation_error_deg", "translation_error_m"):
+        content = (chunk := next(copied.glob(f"{name}/c.*"))).read_bytes()
+        chunk.unlink() if share is None else chunk.write_bytes(content[:int(share * len(content))])
+    Path("big.toml").write_text(GRID.replace("30, 60", "30, 60, 90"))
+    for words in (
+        "report {}", "report {} --error-model e.json", "require {} detection>=0.1", "tradeoff {}",
+        "require good.zarr detection>=0.1 --against {}", "compare {} good.zarr", "verify {}",
+        "compare good.zarr {}", "repro {} --at side_px=30", "run big.toml --reuse {}",
+        "limit {} --along side_px --require detection>=0.1", "verify {} --repair",
+    ):
+        assert main([*words.format("whole.zarr").split()]) == (0 if "--repair" in words else 1)
+        named = r"whole\.zarr: damaged: .*sweep verify \S*whole\.zarr --repair|repaired .*/c\."
+        assert re.search(named, "".join(capsys.readouterr()), re.DOTALL), words
+    assert same(copied, "good.zarr")
 
 
 @pytest.mark.parametrize(("name", "values"), [
@@ -199,9 +211,9 @@ def test_readers_name_what_is_gone_and_what_repairs_it(lost, grid, copied, capsy
 def test_readers_name_a_coordinate_that_was_rewritten(name, values, copied, capsys):
     array = editable(copied, name)
     array[...] = np.array(values, dtype=object if array.dtype.kind in "OTU" else None)
-    with pytest.raises(StoreError, match=rf"{name}/c.*changed.*--repair"):
+    with pytest.raises(DamagedStoreError, match=rf"{name}/c.*changed.*--repair"):
         sweep.open(copied)
-    assert main(["require", str(copied), "detection >= 0.1"]) == 2
+    assert main(["require", str(copied), "detection >= 0.1"]) == 1
     assert f"{name}/c" in capsys.readouterr().err
     assert name in {damage.where.partition("/")[0] for damage in verify(str(copied), 0).damage}
 

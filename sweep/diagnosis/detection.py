@@ -131,18 +131,16 @@ class DetectionModel:
         covariance = turn @ _of_symmetric(
             np.einsum("nk,kij->nij", basis, self.log_covariance), np.exp) @ turn.transpose(0, 2, 1)
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-        bias = np.einsum("nij,nj->ni", turn, basis @ self.bias)
-        bias += self.shift * _lengths(tvec[:, 2])
-        odds = hat_basis(at, self.flip_knots) @ self.flips
+        bias = np.einsum("nij,nj->ni", turn, basis @ self.bias) + self.shift * _lengths(tvec[:, 2])
+        odds = hat_basis(at, self.flip_knots()) @ self.flips
         return xr.Dataset({
             "covariance": (("pose", "row", "column"), covariance, {"units": "m2, m rad, rad2"}),
             "bias": (("pose", "row"), bias, {"units": "m, radian"}),
             "flip_probability": ("pose", 1.0 / (1.0 + np.exp(-odds)), {"units": "1"}),
         }).where(xr.DataArray(known, dims="pose")).assign(known=("pose", known))
 
-    @property
     def flip_knots(self) -> list[Floats]:
-        """Knots of ambiguity, side and viewing angle of the flips."""
+        """Return the knots of ambiguity, side and viewing angle of the flips."""
         return [self.ambiguity_knots, self.side_knots[::3], self.angle_knots[[0, 2, 5]]]
 
     def to_json(self) -> str:
@@ -151,9 +149,23 @@ class DetectionModel:
 
     @classmethod
     def from_json(cls, text: str) -> DetectionModel:
-        """Return the model of `to_json`."""
-        return cls(**json.loads(text, object_hook=lambda attributes: {
-            name: np.array(value)[()] for name, value in attributes.items()}))
+        """Return the model of `to_json`.
+
+        Raises
+        ------
+        DatasetError
+            If there are other attributes, shapes that do not fit, or knots that decrease.
+        """
+        try:
+            model = cls(**json.loads(text, object_hook=lambda attributes: {
+                name: np.array(value)[()] for name, value in attributes.items()}))
+            model.at([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+            for knots in (model.side_knots, model.angle_knots, model.ambiguity_knots):
+                if (np.diff(knots) < 0).any():
+                    raise ValueError("knots that decrease")
+        except (TypeError, ValueError, IndexError) as error:
+            raise DatasetError(f"not the JSON of a model: {error}; make it again") from None
+        return model
 
 
 def error_model(
@@ -275,13 +287,9 @@ def of_simulation(results: xr.Dataset) -> DetectionModel:
     if not np.allclose(focal_sizes, focal_size, rtol=1e-3):
         raise DatasetError("several focal lengths or sizes of the marker: expected a model of each")
     at = _conditions(rvec, tvec, ratio, focal_size)
-    # Across the line of sight, where errors are small: those along it would hide the shift.
-    across = sight_rotation(tvec).transpose(0, 2, 1)[:, :2]
-    moved = np.linalg.solve(across[:, :, :2] * tvec[:, 2, None, None],
-                            across @ errors[:, :3, None])[..., 0]
-    shift = np.zeros(6)
-    shift[[0, 1, 3, 4]] = np.median(
-        np.concatenate([moved, errors[:, 3:5]], axis=1)[~flipped], axis=0)
+    # Less what lies along the line of sight: those errors are large and would hide the shift.
+    moved = (errors[:, :3] - errors[:, 2:3] / tvec[:, 2:] * tvec) / tvec[:, 2:]
+    shift = np.median(np.hstack([moved, errors[:, 3:]])[~flipped], axis=0) * [1, 1, 0, 1, 1, 0]
     side, angle = (np.quantile(at[:, 1 + k], np.linspace(0.0, 1.0, KNOTS[k])) for k in (0, 1))
     angle[0] = 0.0 if angle[0] < FRONTAL_DEG else angle[0]
     errors = errors - shift * _lengths(tvec[:, 2])
@@ -316,7 +324,7 @@ def of_simulation(results: xr.Dataset) -> DetectionModel:
         focal_size, side, angle, ambiguity, shift, bias,
         log_covariance + wider[:, None, None] * np.eye(6), poses, np.zeros(0),
         float(bearing_of(tvec).max()))
-    return dataclasses.replace(model, flips=_flip_fit(at, flipped, model.flip_knots))
+    return dataclasses.replace(model, flips=_flip_fit(at, flipped, model.flip_knots()))
 
 
 def estimated(results: xr.Dataset) -> xr.Dataset:
@@ -346,8 +354,7 @@ def estimated(results: xr.Dataset) -> xr.Dataset:
     scene, dims = results["true_tvec_m"].dims, results["estimate"].dims
     if several := [f"{name} ({results.sizes[name]})" for name in dims
                    if name not in scene and results.sizes[name] > 1]:
-        raise DatasetError(f"several settings: {', '.join(several)}: choose one with "
-                           "results.isel(...)")
+        raise DatasetError(f"several settings: {', '.join(several)}: choose one with .isel(...)")
     table = results[names + ["truth_std"] * ("truth_std" in results)].isel(
         dict.fromkeys(set(dims) - set(scene), 0), drop=True).load().stack(
         pose=[dim for dim in scene if dim != "xyz"], create_index=False).transpose("pose", ...)

@@ -17,8 +17,7 @@ def drawn(seed, count=6000, noise=None):
     tvec = z[:, None] * np.column_stack([rng.uniform(-0.3, 0.3, (count, 2)), np.ones(count)])
     rotation = rotation_of_angles(*np.radians([
         rng.uniform(0, 60, count), rng.uniform(0, 360, count), rng.uniform(0, 360, count)]))
-    side = 90.0 / z
-    sd = np.array([2e-4, 2e-4, 1e-3, 2e-3, 2e-3, 1e-3]) * (90 / side)[:, None]
+    sd = np.array([2e-4, 2e-4, 1e-3, 2e-3, 2e-3, 1e-3]) * z[:, None]
     error = (rng.normal(0, 1, (count, 6)) if noise is None else noise) * sd
     error[:, 2] += 0.002
     error[:, 0] += 2.0 * error[:, 3] / 20
@@ -37,7 +36,7 @@ def drawn(seed, count=6000, noise=None):
         "flipped": ("trial", np.where(
             flipped, Flipped.flipped, Flipped.not_flipped).astype(np.uint8)),
         "estimate": ("trial", np.full(count, EstimateStatus.solved, np.uint8)),
-    }, {"side_px": ("trial", side)})
+    }, {"side_px": ("trial", 90.0 / z)})
 
 
 def photographed(seed, correlation, count=1600):
@@ -87,11 +86,13 @@ def test_a_store_that_shows_no_errors_or_several_cameras_is_refused(change, word
 
 
 def test_outside_what_was_simulated_nothing_is_known_also_from_json(model):
-    frontal = [np.pi, 0.0, 0.0]
     away = [[0, 0, 2.0], [0, 0, 9.0], [3.0, 0, 2.0], [0, 0, -2.0], [np.nan, 0, 2.0], [0, 0, 2.0]]
-    found = model.at([frontal] * 6, away, [0.1, 0.1, 0.1, 0.1, 0.1, np.nan])
+    found = model.at([[np.pi, 0.0, 0.0]] * 6, away, [0.1, 0.1, 0.1, 0.1, 0.1, np.nan])
     assert found["known"].values.tolist() == [True] + [False] * 5
-    assert np.isnan(found["covariance"].values[1:]).all()
-    assert np.isnan(found["flip_probability"].values[1:]).all()
+    assert np.isnan(found.drop_vars("known").isel(pose=slice(1, None)).to_array()).all()
     pose = ([[3.0, 0.2, 0.0]], [[0.1, 0.0, 2.0]], 0.3)
-    assert model.at(*pose).equals(DetectionModel.from_json(model.to_json()).at(*pose))
+    text = model.to_json()
+    assert model.at(*pose).equals(DetectionModel.from_json(text).at(*pose))
+    for part, edited in ("flips", "flip"), ('"bias": [', '"bias": [0, '), (" 0.0,", "99,"):
+        with pytest.raises(DatasetError, match="make it again"):
+            DetectionModel.from_json(text.replace(part, edited, 1))

@@ -823,17 +823,14 @@ def scene_document(pipeline: Pipeline, views: Views, found: SceneFit) -> dict[st
         marker["quiet_zone_modules"] = shortened(min(10.0, *map(clear_modules, on_board)))
     rotation, translation = record.rotation[record.shown], record.translation[record.shown]
     tilt = np.degrees(np.arccos(np.clip(-rotation[:, 2, 2], -1, 1)))
-    bearing = np.abs(translation[:, :2] / translation[:, 2:])
     # Not all of the photographs' bearings, lest markers be cut by the frame.
-    wide = np.degrees(np.arctan(0.8 * np.quantile(bearing, 0.9, axis=0))).tolist()
+    bearing = np.degrees(np.arctan(0.8 * translation[:, :2] / translation[:, 2:]))
     turned = {"uniform": [0.0, 360.0]}
     pose = {
         "distance_m": _between(translation[:, 2]), "tilt_deg": _between(tilt),
         "azimuth_deg": turned, "roll_deg": turned,
+        "bearing_x_deg": _between(bearing[:, 0]), "bearing_y_deg": _between(bearing[:, 1]),
     }
-    for name, each in zip(("bearing_x_deg", "bearing_y_deg"), wide, strict=True):
-        if each > 0:
-            pose[name] = {"uniform": [-shortened(each), shortened(each)]}
     return {
         "title": f"The camera of {plain(pipeline.name)}",
         "camera": {name: fixed[name] for name in CAMERA},

@@ -244,11 +244,9 @@ def _split(edges: MarkerEdges) -> tuple[Floats, Integers]:
 
 def _along(image: Grey, outline: Floats) -> float:
     """Return the median level along an outline (4, 2) in pixels; NaN outside the image."""
-    t = np.linspace(0.0, 1.0, 20, endpoint=False)[:, None, None]
-    points = np.rint((1 - t) * outline + t * np.roll(outline, -1, axis=0)).reshape(-1, 2)
-    inside = ((points >= 0) & (points < image.shape[::-1])).all(axis=1)
-    columns, rows = points[inside].astype(np.int64).T
-    return float(np.median(image[rows, columns])) if inside.any() else np.nan
+    line = np.zeros_like(image)
+    cv2.polylines(line, [np.rint(outline).astype(np.int32)], isClosed=True, color=1)
+    return float(np.median(image[line > 0])) if line.any() else np.nan
 
 
 # --------------------------------------------------------------------------------------------------
@@ -314,8 +312,9 @@ LOW = np.array([*[-2 * MAX_SHIFT_PX] * CORNERS, -np.inf, -np.inf, 0.02, -0.95, -
 #: Range of the parameters.
 HIGH = np.array([*[2 * MAX_SHIFT_PX] * CORNERS, np.inf, np.inf, 100.0, 10.0, 0.95])
 
-#: The photograph's parameters at which a fit starts.
-START = np.array([0.5, 0.0, 0.0])
+#: The photograph's parameters at which a fit starts, and the shares of a marker's pixels below the
+#: levels of black and white at which it starts.
+START, START_SHARES = np.array([0.5, 0.0, 0.0]), (0.1, 0.9)
 
 
 class MarkerState(NamedTuple):
@@ -399,15 +398,6 @@ def state_at(marker: FittedMarker, parameters: Floats) -> MarkerState:
     )
 
 
-def start_of(marker: FittedMarker, shared: Floats) -> Floats:
-    """Return the parameters of a marker at its true corners, its levels by least squares."""
-    parameters = np.concatenate([np.zeros(CORNERS), [0.0, 1.0], shared])
-    share = state_at(marker, parameters).share
-    design = np.stack([np.ones_like(share), share], axis=1)
-    parameters[CORNERS:OWN] = np.linalg.lstsq(design, marker.levels, rcond=None)[0]
-    return parameters
-
-
 def fitted_state(marker: FittedMarker, start: Floats, moved: Masks) -> MarkerState:
     """Return the state of least squares; ``moved`` (13,) says which parameters are moved."""
     at = state_at(marker, start)
@@ -484,11 +474,14 @@ def fit_photograph(
         (3,) the parameters at which it starts.
     """
     own, shared = np.arange(ALL) < OWN, start.copy()
-    starts = [start_of(each, shared) for each in markers]
+    starts = [
+        np.concatenate([np.zeros(CORNERS), [black, white - black], shared])
+        for black, white in (np.quantile(each.levels, START_SHARES) for each in markers)
+    ]
     states = _good([
         fitted_state(marker, start, np.append(own[:OWN], moved))
         for marker, start in zip(markers, starts, strict=True)
-        if abs(start[CORNERS + 1]) > MIN_CONTRAST
+        if start[CORNERS + 1] > MIN_CONTRAST
     ])
     if not states:
         return None

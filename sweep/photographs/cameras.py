@@ -169,12 +169,35 @@ def fitted_board(camera: Calibration, found: FoundCorners) -> FittedPose | None:
     if len(found.points) < MIN_CORNERS:
         return None
     guard = GuardedPoints.of(found.points, found.pixels, cameras_of(camera, 1))
-    fits = [
-        fit_pose(camera, found.points, found.pixels, *start)
-        for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_IPPE) for start in guard.poses(method)
-    ]
+    starts = guard.poses(cv2.SOLVEPNP_IPPE)
+    fits = [fit_pose(camera, found.points, found.pixels, *start) for start in starts]
     good = [fit for fit in fits if fit is not None and fit.used.sum() >= MIN_CORNERS]
     return min(good, key=lambda fit: float(np.median((fit.residuals**2).sum(axis=1))), default=None)
+
+
+# --------------------------------------------------------------------------------------------------
+# Edges of black squares that are shifted: cameras blur light before they make levels of it, so that
+# black looks smaller, and ink spreads. Each marker is smaller then, around its own centre, as no
+# change of the pose or of the camera has it. In rendered photographs of a grid, with gamma,
+# denoising, sharpening and JPEG, edges are shifted by 0.3 px: poses beside a calibration from these
+# photographs were off by 0.15 % of the range and 0.06 degrees, and are by 0.04 % and 0.007 degrees.
+
+#: Rounds in which a shift is estimated beside the pose, which takes up less than half of it, and
+#: rounds of that and of a calibration.
+SHIFT_ROUNDS, CALIBRATIONS = 8, 3
+
+
+def unshifted(camera: Calibration, found: FoundCorners) -> FoundCorners:
+    """Return a board's corners in a photograph without the shift of edges beside its pose."""
+    pose = fitted_board(camera, found)
+    for _ in range(SHIFT_ROUNDS):
+        if pose is None or found.outward is None:
+            break
+        outward = found.outward * pose.used[:, None]
+        shift = (pose.residuals * outward).sum() / (outward**2).sum()
+        found = found._replace(pixels=found.pixels + shift * found.outward)
+        pose = fit_pose(camera, found.points, found.pixels, *pose[:2], pose.used)
+    return found
 
 
 # --------------------------------------------------------------------------------------------------
@@ -291,9 +314,6 @@ DOUBTFUL_PX = 0.5
 #: Share of that RMS below which another resolution fits.
 CLEARLY_BETTER = 0.5
 
-#: Photographs with the most corners in which they are tried.
-MAX_TRIED_VIEWS = 5
-
 #: Resolutions of photographs over the resolution of a calibration.
 SCALES = tuple(map(Fraction, ("1/4", "1/3", "1/2", "2/3", "3/4", "4/3", "3/2", "2", "3", "4")))
 
@@ -322,13 +342,11 @@ def check_resolution(
     """
     fault = _rms_fault(rms_px, size)
     if rms_px >= DOUBTFUL_PX:
-        best = sorted(found, key=lambda each: -len(each.points))[:MAX_TRIED_VIEWS]
-        own = _median_rms(camera, best)
         least, scale = min(
-            (_median_rms(scaled(camera, float(each)), best), each) for each in SCALES)
-        if least < CLEARLY_BETTER * own:
+            (_median_rms(scaled(camera, float(each)), found), each) for each in SCALES)
+        if least < CLEARLY_BETTER * rms_px:
             fault = (
-                f"the board's corners are {own:.2g} px RMS beside it, and {least:.2g} px if its "
+                f"the board's corners are {rms_px:.2g} px RMS beside it, and {least:.2g} px if its "
                 f"numbers are times {scale}: it is of another resolution; give the calibration of "
                 f"{size[0]} x {size[1]}"
             )

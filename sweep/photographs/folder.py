@@ -22,7 +22,7 @@ from sweep.messages import nearest_file, plain, shown
 from sweep.model.board import Board, unit_m
 from sweep.model.image_file import IMAGE_SUFFIXES, Part, decode_grey, read_image
 from sweep.model.marker import module_count, opencv_dictionary_names
-from sweep.model.polygon import side_lengths
+from sweep.model.polygon import following, side_lengths
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -185,7 +185,7 @@ def detect_markers(
 # homography says where they are about, and ``cv2.cornerSubPix`` measures them. So are the markers'
 # corners of a board with black squares at them, whose outlines run together with the markers': a
 # detector's corners may be off by pixels. Of other boards they are the markers' corners, as OpenCV
-# refines them.
+# refines them; all edges are shifted there, which `sweep.photographs.cameras.unshifted` takes back.
 
 #: Markers whose corners give the homography around a corner of the chessboard.
 NEIGHBOURS = 4
@@ -209,11 +209,15 @@ class FoundCorners(NamedTuple):
         (n, 3) in the board's frame in m, and (n, 2) px.
     number
         (n,) numbers of the corners: of the chessboard's, or 4 · marker + corner.
+    outward
+        (n, 2) px by which they move if the edges of black squares move outwards by 1 px; None where
+        two black squares meet, whose corner stays.
     """
 
     points: Floats
     pixels: Floats
     number: Integers
+    outward: Floats | None = None
 
 
 def find_corners(image: NDArray[np.uint8], board: Board, seen: SeenMarkers) -> FoundCorners:
@@ -226,7 +230,12 @@ def find_corners(image: NDArray[np.uint8], board: Board, seen: SeenMarkers) -> F
         points = board.corners_m.reshape(-1, 3)
         number = (4 * marker[:, None] + np.arange(4)).ravel()
         if not board.squares_m:
-            return FoundCorners(points[number], quads.reshape(-1, 2), number)
+            along = following(quads) - quads
+            along /= np.linalg.norm(along, axis=2, keepdims=True)
+            before = np.roll(along, 1, axis=1)
+            outward = (before - along) / np.linalg.det(np.stack([before, along], -1))[..., None]
+            pixels, outward = quads.reshape(-1, 2), outward.reshape(-1, 2)
+            return FoundCorners(points[number], pixels, number, outward)
         step_m = unit_m(board) * module_count(board.dictionary) + board.squares_m
         clear_m = min(unit_m(board), board.squares_m)  # up to the marker's bits
     flat = board.corners_m[marker][..., :2]
@@ -261,8 +270,6 @@ def _saddle(
     if len(near) < 2 or distance[near[0]] > 1.01 * step_m:
         return None
     transform, _ = cv2.findHomography(flat[near].reshape(-1, 2), quads[near].reshape(-1, 2))
-    if transform is None:
-        return None
     start, *around = cv2.perspectiveTransform((point + clear_m * CROSS)[None], transform)[0]
     others = around if clear_m else quads[near]
     offset = np.abs(np.reshape(others, (-1, 2)) - start).max(axis=1).min()
@@ -422,15 +429,11 @@ def measured_side(board: Board, seen: Sequence[SeenMarkers]) -> float:
     """Return the side of the markers over the board's, by the distances of their centres."""
     ratios: list[float] = []
     for flat, quads, _ in _flat_markers(board, seen, 4):
-        tolerance = float(np.ptp(flat[0], axis=0).max()) / 4
-        transform, _ = cv2.findHomography(
-            quads.mean(axis=1), flat.mean(axis=1), cv2.RANSAC, tolerance
-        )
+        transform, _ = cv2.findHomography(quads.mean(axis=1), flat.mean(axis=1))
         if transform is None:
             continue
         back = cv2.perspectiveTransform(quads.reshape(1, -1, 2), np.asarray(transform))
-        sides = side_lengths(back.reshape(-1, 4, 2)).mean(axis=1)
-        ratios += (sides / side_lengths(flat).mean(axis=1)).tolist()
+        ratios += (side_lengths(back.reshape(-1, 4, 2)) / side_lengths(flat)).mean(axis=1).tolist()
     return float(np.median(ratios)) if ratios else 1.0
 
 

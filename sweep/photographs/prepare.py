@@ -186,7 +186,9 @@ def prepare(
     elif str(camera) != CALIBRATE:
         known = [cameras.camera_of_file(str(camera), first.size)]
     else:
-        calibrated, line = cameras.calibrate(first.size, corners)
+        for _ in range(1 if corners[0].outward is None else cameras.CALIBRATIONS):
+            calibrated, line = cameras.calibrate(first.size, corners)
+            corners = [cameras.unshifted(calibrated, each) for each in corners]
         known, lines = [calibrated], [*lines, line]
     described = json.dumps(document, sort_keys=True) if document else ""
     sizes_m = np.array(list(sizes.values()))
@@ -198,6 +200,7 @@ def prepare(
     if poses is not None:
         lines += poses_of_file(one, Path(poses))
     elif target is not None and (rig is None or one_camera):
+        corners = [cameras.unshifted(one.camera, each) for each in corners]
         rms_px = board_poses(one, target, corners)
         if rig is None and str(camera) != CALIBRATE:
             cameras.check_resolution(str(camera), one.camera, first.size, corners, rms_px)

@@ -245,7 +245,7 @@ def test_corners_of_grids_are_where_they_were_printed(document):
         found = cameras.unshifted(Calibration(*SIZE, *VIEW, (), (), ()), raw)
         seen, off = (np.abs(each.pixels - imaged(raw.points, turn, shift)) for each in (raw, found))
         assert len(raw.number) >= 10
-        assert off.max() < 0.3 if raw.outward is None else off.mean() < 0.5 * seen.mean()
+        assert off.max() < 0.3 if raw.outward is None else off.mean() < 0.7 * seen.mean()
 
 
 CAMERA = Calibration(*SIZE, *VIEW, (0.1, -0.2, 0.001, -0.001, 0.05), (), ())

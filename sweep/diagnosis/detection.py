@@ -349,7 +349,7 @@ def estimated(results: xr.Dataset) -> xr.Dataset:
     if missing := [name for name in names if name not in results]:
         raise DatasetError(f"no variable {missing[0]}: expected a run that solves poses")
     if "trial" not in results.dims:
-        results = results.expand_dims("trial")
+        results = results.drop_vars("trial", errors="ignore").expand_dims("trial")
     results = results.assign_coords(trial=np.arange(results.sizes["trial"]))
     scene, dims = results["true_tvec_m"].dims, results["estimate"].dims
     if several := [f"{name} ({results.sizes[name]})" for name in dims

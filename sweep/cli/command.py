@@ -402,7 +402,7 @@ def print_error(error: SweepError) -> int:
 def print_system_error(error: OSError | MemoryError | RuntimeError) -> int:
     """Print one line if the system refused something; any other RuntimeError is a defect."""
     if isinstance(error, MemoryError):
-        line, number = "out of memory", errno.ENOMEM
+        line, number = ": ".join(filter(None, ["out of memory", str(error)])), errno.ENOMEM
     elif isinstance(error, OSError):
         cause = str(error.filename or "the system refused a request")
         line, number = f"{cause}: {error.strerror or error}", error.errno or 0

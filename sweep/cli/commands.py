@@ -1063,9 +1063,9 @@ def plugins(
     if tried is not None:
         raise ArgumentError(
             "tried", tried, f"expected one name; `sweep plugins check {tried}` tries it")
-    if settings or dictionary:
-        raise ArgumentError(
-            "settings" if settings else "dictionary", "", "expected `check` and a name")
+    if settings or dictionary or name == "check":
+        raise ArgumentError("settings" if settings else "dictionary" if dictionary else "tried", "",
+                            "expected a name behind `check`")
     if name is None:
         every = library.loading.installed()
         lines = [f"{each['kind']:10} {each['name']:20} of {each['distribution']}"

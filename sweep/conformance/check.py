@@ -151,9 +151,8 @@ def judged_poses(answers: Sequence[Answer], scenes: Scenes) -> Finding:
     error = pose_error(found.rotation, found.translation, scenes.rotation[rows], truth)
     away = np.linalg.norm(error.translation_m, axis=1) / np.linalg.norm(truth, axis=1)
     turned, percent = np.degrees(np.median(error.rotation_angle_rad)), 100 * np.median(away)
-    right = turned <= MAX_ROTATION_DEG and percent <= MAX_POSITION_PERCENT
     return Finding(
-        OK if right else FAULT,
+        OK if turned <= MAX_ROTATION_DEG and percent <= MAX_POSITION_PERCENT else FAULT,
         f"median errors {turned:.2g} deg and {percent:.2g} % of the distance")
 
 

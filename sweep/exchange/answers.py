@@ -95,8 +95,7 @@ POSITION = ("tx", "ty", "tz")
 ALIASES = {
     "file": "image", "filename": "image", "file_name": "image", "image_name": "image",
     "marker_id": "id", "markerid": "id", "tag_id": "id",
-    **{f"rvec_{axis}": f"r{axis}" for axis in "xyz"},
-    **{f"tvec_{axis}": f"t{axis}" for axis in "xyz"},
+    **{f"{part}vec_{axis}": f"{part}{axis}" for part in "rt" for axis in "xyz"},
     **{f"{axis}_{corner}": f"{axis}{corner}" for corner in range(4) for axis in "xy"},
 }
 
@@ -127,8 +126,9 @@ def _table(text: str, source: str, faults: dict[int, str]) -> pd.DataFrame:
     PipelineError
         If the header is at fault.
     """
-    lines = {
-        number: line for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1)
+    lines = {  # what is cut of a line is at fault in any case
+        number: line[:csv.field_size_limit()]
+        for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1)
         if line.strip() and not line.lstrip().startswith("#")
     }
     separator = max(SEPARATORS, key=next(iter(lines.values()), "").count)
@@ -148,8 +148,8 @@ def _table(text: str, source: str, faults: dict[int, str]) -> pd.DataFrame:
         hint = nearest(unknown[0], missing) if unknown else ""
         poses = "" if groups else ", or rx, ry, rz, tx, ty, tz of poses"
         fault = (
-            f"no column {', '.join(missing)}{poses}; the header has "
-            f"{', '.join(plain(name, 40) for name in written)}{hint}")
+            f"no column {', '.join(missing)}{poses}; the header has, between commas, semicolons or "
+            f"tabs, {', '.join(plain(name, 40) for name in written)}{hint}")
     elif more := [name for name in written if re.fullmatch("[xy]_?[4-9]", name.lower())]:
         fault = f"the column {plain(more[0])}: expected four corners, x0, y0 to x3, y3"
     elif repeated := [name for name in expected if header.count(name) > 1]:

@@ -7,6 +7,7 @@ import functools
 import hashlib
 import json
 import multiprocessing
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ from sweep.exchange.answers import CORNER_COLUMNS, POSITION, VECTOR
 from sweep.execution.forecast import free_bytes
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import LABELS
+from sweep.isolation.child_process import end_with
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label, plain
 from sweep.model.polygon import signed_areas
@@ -406,7 +408,8 @@ def export(
     count = len(pipeline.experiment.all_scenes)
     parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]
     pool = contextlib.nullcontext() if (workers or 1) == 1 else ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"))
+        workers, mp_context=multiprocessing.get_context("spawn"), initializer=end_with,
+        initargs=(os.getpid(),))
     with translate_errors(plain(folder, 300), "written"), pool as processes:
         mark = _mark(pipeline, windowed)
         begun = _is_begun(target, mark)
@@ -417,8 +420,7 @@ def export(
             _write_experiment(pipeline, target)
             write_whole(target / MARK, json.dumps(mark, indent=2).encode() + b"\n")
         finished = (target / CHECKSUMS).exists()
-        files: list[ImageFile] = []
-        truths: list[Truth] = []
+        files, truths = list[ImageFile](), list[Truth]()
         work = functools.partial(write_images, pipeline, target, windowed, finished)
         try:
             for of_images, truth in (processes.map if processes else map)(work, parts):

@@ -49,14 +49,9 @@ def hints(corners: Floats, truth: Floats, conventions: Conventions) -> list[str]
     order, distance = fitting_order(corners, truth)
     lines = []
     if order != (0, 1, 2, 3) and distance < FITS:
-        # corner k of the truth is corner order[k] of the answers, which they call ...
-        theirs = [""] * 4
-        for k, j in enumerate(order):
-            theirs[conventions.corners.index(CORNERS[j])] = CORNERS[k]
-        lines.append(
-            f'the corners come in the order {" ".join(theirs)}: pass --corner-order '
-            f'"{" ".join(theirs)}"'
-        )
+        # Corner k of the truth is corner order[k] of the answers: the one called CORNERS[order[k]].
+        theirs = " ".join(CORNERS[order.index(CORNERS.index(name))] for name in conventions.corners)
+        lines.append(f'the corners come in the order {theirs}: pass --corner-order "{theirs}"')
         corners = corners[:, order]
     offset = np.median((corners - truth).mean(axis=1), axis=0)
     if (np.abs(np.abs(offset) - 0.5) < 0.1).all() and offset[0] * offset[1] > 0:
@@ -242,9 +237,8 @@ def _pipeline(
     settings: Sequence[str],
 ) -> Pipeline:
     """Return the export's pipeline with recorded detections in the place of its detector."""
-    detectors = [f"{label}{SUFFIX}" for label in labels]
-    if beside:
-        detectors = [*dict.fromkeys(exported.values_of("detector")), *detectors]
+    detectors = [*(dict.fromkeys(exported.values_of("detector")) if beside else ()),
+                 *(f"{label}{SUFFIX}" for label in labels)]
     ours = {"detector": detectors if len(detectors) > 1 else detectors[0]} | (
         {"solver": "recorded"} if posed and not beside else {})
     document = tomlkit.parse(exported.text)
@@ -258,6 +252,10 @@ def _pipeline(
             axes.update({name: toml_item([*dict.fromkeys(values)])
                          for name, values in axis.columns.items() if beside and name not in ours})
     chosen = [f"{name}={json.dumps(value)}" for name, value in ours.items()]
-    return Pipeline.from_text(
+    scored = Pipeline.from_text(
         tomlkit.dumps(document), [*chosen, *settings], name="-".join(labels),
         source=str(home / "pipeline.toml"), folder=home)
+    if not {*detectors} <= {*scored.values_of("detector")}:
+        raise ArgumentError("settings", "detector", "expected none: the answers are the detector; "
+                            "the experiment's own is added by --beside (in Python, beside=True)")
+    return scored

@@ -194,7 +194,7 @@ _START = (
 
 def serve(module: str, descriptor: str) -> None:
     """Import a module, then answer calls until the caller has closed; what the child runs."""
-    threading.Thread(target=_end_after, args=(os.getppid(),), daemon=True).start()
+    end_with(os.getppid())
     connection: Connection[Any, Any] = Connection(int(descriptor))
     os.set_inheritable(connection.fileno(), False)
     with contextlib.suppress(OSError):  # it is killed before others if memory runs out
@@ -214,11 +214,15 @@ def serve(module: str, descriptor: str) -> None:
                 connection.send(None)
                 with ending_after(limit_s):
                     answer = (False, function(*arguments))
-            except SweepError as error:
-                answer = (True, error)
             except Exception as error:
-                answer = (True, machine_fault(error) or traceback.format_exc())
+                told = error if isinstance(error, SweepError) else machine_fault(error)
+                answer = (True, told or traceback.format_exc())
             connection.send(answer)
+
+
+def end_with(parent: int) -> None:
+    """Watch for the end of this process' parent, of this ID, and end then, whatever is computed."""
+    threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
 
 
 def _end_after(parent: int) -> None:

@@ -441,8 +441,8 @@ def plugged(setting: PluginSetting) -> FindFunction:
             raise PluginError(f"{name}: changed the image that it was given; copy it first")
         if not isinstance(returned, tuple) or len(returned) not in (2, 3):
             raise PluginError(
-                f"{name}: returned a {type(returned).__name__}; expected a tuple "
-                "(corners, ids), or with rejected quadrilaterals as the third"
+                f"{name}: returned a {type(returned).__name__}; expected a tuple of "
+                "two, (corners, ids), or of three, with rejected quadrilaterals"
             )
         corners, ids, *rest = returned
         quads = quadrilaterals("corners", corners)

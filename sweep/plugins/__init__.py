@@ -195,7 +195,8 @@ EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "distribution": (lambda names: isinstance(names, str | Sequence), "a name, or several"),
     "families": (lambda names: isinstance(names, Mapping | None), "names by dictionary, or None"),
     "pixel_center": (lambda at: isinstance(at, float | int) and -1 <= at <= 1, "0 or 0.5"),
-    "corner_order": (lambda order: sorted(order) == [0, 1, 2, 3], "the numbers 0 to 3, each once"),
+    "corner_order": (lambda order: isinstance(order, Sequence) and sorted(map(repr, order)) == [
+        "0", "1", "2", "3"], "the numbers 0 to 3, each once"),
     "step": (lambda step: step in ("light", "signal"), "light or signal"),
     "widens": (lambda widens: widens in get_args(Widens), "nothing, noise or uneven light"),
 }

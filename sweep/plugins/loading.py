@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Literal, Self, cast, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.declaration import Declared, declared_fields
+from sweep.declaration import Declared, check_table, declared_fields
 from sweep.errors import ArgumentError, PluginError
 from sweep.messages import exception_line, nearest, nearest_file, plain
 from sweep.plugins import RECORDS, DetectorPlugin, Markers, Plugin, Widens
@@ -51,20 +51,21 @@ def printing_to_stderr() -> Iterator[None]:
 def _its_faults(begin: str = "a plug-in that can be imported:", path: str = "") -> Iterator[None]:
     """Raise PluginError for whatever is raised, also for an attempt to exit: one line.
 
-    The line begins with a text and ends, for a plug-in in a file, with its line of the file. If
-    memory runs out, or the user interrupts, that is raised. Workers ignore interrupts: there a
-    plug-in raised it itself.
+    The line begins with a text and ends, for a plug-in in a file, with its line of the file. It is
+    that of a MemoryError if memory runs out. If the user interrupts, that is raised; workers ignore
+    interrupts: there a plug-in raised it itself.
     """
     ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     try:
         yield
     except BaseException as error:
-        if isinstance(error, (MemoryError,) if ignored else (MemoryError, KeyboardInterrupt)):
+        if isinstance(error, KeyboardInterrupt) and not ignored:
             raise
         lines = [line for file, line, *_ in traceback.extract_tb(error.__traceback__)
                  if file == path]
         where = f" (line {lines[-1]} of {Path(path).name})" if lines else ""
-        raise PluginError(f"{begin} {plain(exception_line(error))}{where}") from error
+        kind = MemoryError if isinstance(error, MemoryError) else PluginError
+        raise kind(f"{begin} {plain(exception_line(error))}{where}") from error
 
 
 def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -73,8 +74,8 @@ def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     Raises
     ------
     PluginError
-        For whatever it raises, also for an attempt to exit; not if memory runs out, or the user
-        interrupts.
+        For whatever it raises, also for an attempt to exit; not if memory runs out, which is a
+        MemoryError that names it, or the user interrupts.
     """
     with contextlib.redirect_stdout(sys.stderr), _its_faults(f"{name}: raises"):
         return function(*arguments)
@@ -302,9 +303,6 @@ def recorded_detector(path: Path) -> tuple[RecordedDetector, str]:
 # A file is executed from the bytes whose digest is taken. It is a module of its own: one that
 # imports others beside it is refused, so that the digest says all of it.
 
-#: Its adapters' results change with the version of the numbers, which is recorded in any case.
-OWN_DISTRIBUTION = "fiducial-sweep"
-
 #: Distributions and their versions.
 Versions = tuple[tuple[str, str], ...]
 
@@ -376,7 +374,8 @@ def load(kind: str, name: str, folder: str) -> tuple[Plugin, str, Versions]:
         entry = _entry_point(kind, name)
         with _its_faults(), printing_to_stderr():
             found = entry.load()
-        if entry.dist is not None and entry.dist.name != OWN_DISTRIBUTION:
+        # Our adapters' results change with the version of the numbers, which is recorded anyway.
+        if entry.dist is not None and entry.dist.name != "fiducial-sweep":
             versions[entry.dist.name] = entry.dist.version
     if callable(found) and not isinstance(found, Plugin) and kind != "effect":
         found = record(**{"render" if kind == "renderer" else "make": found})
@@ -419,9 +418,6 @@ def _module(path: str, digest: str, source: bytes) -> ModuleType:
 
 #: Types that a setting may have.
 TYPES: dict[str, type] = {"float": float, "int": int, "bool": bool, "str": str}
-
-#: Declarations that are taken over from a plug-in's record.
-TRAITS = ("needs_images", "of_boards", "random", "widens", "step")
 
 #: Key of the plug-ins in a store's metadata.
 RECORDED = "plugins"
@@ -524,11 +520,11 @@ def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
         In one line, what was expected instead.
     """
     record, digest, versions = load(kind, name, folder)
-    return DeclaredPlugin(
-        kind, name, record.meaning, versions, file_of(name), digest, _settings(kind, record),
-        tuple(getattr(record, "families", None) or ()),
-        **{trait: value for trait, value in vars(record).items() if trait in TRAITS},
-    )
+    shared = {key: value for key, value in vars(record).items() if key in DeclaredPlugin.__slots__}
+    return DeclaredPlugin(**shared | {
+        "kind": kind, "name": name, "versions": versions, "file": file_of(name), "digest": digest,
+        "settings": _settings(kind, record),
+        "dictionaries": tuple(map(str, getattr(record, "families", None) or ()))})
 
 
 def _settings(kind: str, record: Plugin) -> tuple[Declared, ...]:
@@ -540,15 +536,17 @@ def _settings(kind: str, record: Plugin) -> tuple[Declared, ...]:
     with _its_faults(expected):
         fields = dataclasses.fields(record.settings) if record.settings else ()
         wrong = [each.name for each in fields if "declaration" not in each.metadata]
-        declared = [] if wrong or not record.settings else [
-            *declared_fields(record.settings).values()]
-        wrong += [each.name for each in declared
-                  if each.reads or not {one.__name__ for one in each.types} <= {*types}]
+        declared = declared_fields(record.settings) if record.settings and not wrong else {}
+        wrong += [name for name, each in declared.items() if each.reads
+                  or not {one.__name__ for one in each.types} <= {*types}
+                  or {*map(type, (each.meaning, each.unit, *each.choices))} != {str}]
+        given = {name: each.default for name, each in declared.items() if each.default is not None}
+        wrong = wrong or check_table(declared, given, "")[1]
     if wrong:
         raise PluginError(f"{expected} {', '.join(wrong)}")
     if kind == "effect" and not declared:
         raise PluginError("settings, of which the first switches the effect on")
-    return tuple(declared)
+    return tuple(declared.values())
 
 
 # --------------------------------------------------------------------------------------------------
@@ -568,9 +566,8 @@ def described(name: str, folder: str = ".") -> list[DeclaredPlugin]:
     ArgumentError
         If there is none, or one cannot be used.
     """
-    kinds = [kind for kind in RECORDS if file_of(name) or name in offered(kind).names]
     found, faults = [], []
-    for kind in kinds:
+    for kind in [each for each in RECORDS if file_of(name) or name in offered(each).names]:
         try:
             found.append(declare(kind, name, folder))
         except PluginError as error:

@@ -17,6 +17,7 @@ from sweep.errors import ArgumentError, RunError, StoreError
 from sweep.exchange import export as exporting
 from sweep.exchange.export import export
 from sweep.experiment.pipeline import Pipeline
+from sweep.isolation.child_process import end_with
 
 
 @pytest.fixture(scope="module")
@@ -130,10 +131,8 @@ def test_an_interrupted_export_continues_and_damage_is_repaired(exported, pipeli
 
 
 def files_of(folder):
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob("*") if path.is_file()
-    }
+    return {path.relative_to(folder).as_posix(): path.read_bytes()
+            for path in folder.rglob("*") if path.is_file()}
 
 
 def test_folders_of_others_and_what_is_large_are_refused_in_a_line(
@@ -160,9 +159,10 @@ def test_folders_of_others_and_what_is_large_are_refused_in_a_line(
             export(some, tmp_path / "new", **options)
     assert not (tmp_path / "new").exists()
     pool = nullcontext(mock.Mock(map=mock.Mock(side_effect=BrokenExecutor)))
-    monkeypatch.setattr(exporting, "ProcessPoolExecutor", lambda *_, **__: pool)
+    monkeypatch.setattr(exporting, "ProcessPoolExecutor", made := mock.Mock(return_value=pool))
     with pytest.raises(RunError, match="a process ended; use fewer workers"):
         export(pipeline, tmp_path / "new", workers=2, yes=True)
+    assert made.call_args.kwargs["initializer"] is end_with  # none outlives the command
 
 
 def test_scenes_without_a_visible_marker_have_no_image_and_are_counted(tmp_path, capsys):

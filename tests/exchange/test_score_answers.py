@@ -236,7 +236,8 @@ BAD = {
     "an unknown image": (GOOD.replace("{0}", "frame1.png"), ("line 2: image frame1.png is not "
                          "among the images; expected a name such as 000000-")),
     "a doubled row": (GOOD + "{0},0,1,2,3,4,5,6,7,9\n", "line 3: image {0} has ID 0 twice, here"),
-    "a missing column": (GOOD.replace("y3", "yy3"), "line 1: no column y3; the header has "),
+    "other separators": (GOOD.replace(",", "|"), "between commas, semicolons or tabs, image|id"),
+    "a cell without end": (GOOD + "x" * 200_000, "line 3: 1 values; expected 10, as the header"),
     "NaN": (GOOD.replace(",8", ",nan"), "line 2: y3 = nan: expected a finite number"),
     "a quaternion of length 2": (
         "image,id,qw,qx,qy,qz,tx,ty,tz\n{0},0,2,0,0,0,0,0,1\n", "a quaternion of length 2"),
@@ -265,6 +266,7 @@ def test_what_cannot_be_scored_is_refused_in_a_line(exported, tmp_path):
         (tmp_path, [good], {}, StoreError, "not an export; make one with `sweep export"),
         (exported, [good, good], {}, ArgumentError, "another name for each file"),
         (exported, [good], {"names": ["../a"]}, ArgumentError, "letters, digits"),
+        (exported, [good], {"settings": ["detector=opencv"]}, ArgumentError, "beside=True"),
         (exported, [good], {"doubled": "none"}, ArgumentError, "none: expected refuse or nearest"),
     ):
         with pytest.raises(error, match=line):

@@ -154,8 +154,7 @@ def test_an_installed_detector_is_named_and_its_version_recorded(site):
     metadata = site / "fast_markers-1.3.dist-info" / "METADATA"
     metadata.write_text(metadata.read_text().replace("1.2.3", "1.3"))
     assert lacking_plugins(pipeline.plugins, ".") == [
-        "detector turned: expected fast-markers 1.2.3, not fast-markers 1.3"
-    ]
+        "detector turned: expected fast-markers 1.2.3, not fast-markers 1.3"]
     (plugin,) = pipeline.plugins
     with pytest.raises(PluginError):
         plugin.record(".")
@@ -289,7 +288,7 @@ def bad(tmp_path):
      "returned corners of which some are masked; expected NaN or none"),
     ("(ONE, [0.0])", "returned ids of type float64; expected whole numbers"),
     ("(ONE, [-1])", "returned the ID -1; expected at least 0"),
-    ("None", "returned a NoneType; expected a tuple (corners, ids)"),
+    ("None", "returned a NoneType; expected a tuple of two, (corners, ids), or of three"),
     ("(image.fill(0), ([], []))[1]", "changed the image that it was given; copy it first"),
     ("open('model.onnx')", "raises FileNotFoundError"),
     ("os.sys.exit(3)", "raises SystemExit: 3"),
@@ -299,14 +298,15 @@ def test_an_image_at_which_a_detector_is_at_fault_is_flagged(bad, returned, told
     try_plugins(pipeline)  # on a blank frame nothing is wrong
     cells = run_cells(pipeline, [])
     assert [flags.tolist() for flags in cells.columns["detection"]] == [
-        [DetectionStatus.detected], [DetectionStatus.failed],
-    ]
+        [DetectionStatus.detected], [DetectionStatus.failed]]
     (failure,) = cells.failures
     assert (failure.stage, failure.setting) == ("detection", 1)
     assert f"PluginError: bad:D: {told}" in failure.text.splitlines()[-1]
 
 
-def test_an_interrupt_that_a_plug_in_raises_itself_is_its_fault_in_a_worker():
+def test_too_little_memory_names_the_plug_in_whose_own_interrupt_is_its_fault_in_a_worker():
+    with pytest.raises(MemoryError, match="bad:full: raises MemoryError"):
+        call("bad:full", mock.Mock(side_effect=MemoryError))
     interrupted = mock.Mock(side_effect=KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):  # as the user's
         call("bad:interrupted", interrupted)
@@ -341,12 +341,12 @@ def test_what_a_function_margin_px_raises_is_the_plug_in_s_fault(bad):
     ("import beside_it\nD = print", "imports beside_it.py beside it; put both"),
     ("from sweep.plugins import DetectorPlugin\nD = DetectorPlugin(make=1)",
      "ValueError: make = 1: expected a class or function (line 2 of mine.py)"),
-    ("from sweep.plugins import *\nD = DetectorPlugin(make=print, distribution=(3,))",
-     "the distribution 3, which is not installed"),
+    (MINE.replace("high=9", "high=-1").replace("TURNED", "D"),
+     "not so: shift_px = 0.0: expected a number from -9 to -1"),
     ("from sweep.plugins import *\nD = DetectorPlugin(make=print, distribution='not-there-9')",
      "the distribution not-there-9, which is not installed: `pip install not-there-9`"),
-    ("from sweep.plugins import *\nD = DetectorPlugin(make=print, pixel_center='half')",
-     "ValueError: pixel_center = 'half': expected 0 or 0.5 (line 2 of mine.py)"),
+    ("from sweep.plugins import *\nD = DetectorPlugin(make=print, corner_order=(0., 1., 2., 3.))",
+     "corner_order = (0.0, 1.0, 2.0, 3.0): expected the numbers 0 to 3, each once (line 2"),
     (MINE.replace("shift_px", "tilt_deg").replace("TURNED", "D"),
      "another name for its setting tilt_deg: the pipeline has this one"),
 ])
@@ -424,8 +424,7 @@ def test_an_effect_s_faults_are_its_scene_s(tmp_path, result, told):
     text = 'effects = ["bad:E"]\n[pose]\nside_px = 60\n[axes]\nfog = [0, 0.5]\n'
     cells = run_cells(Pipeline.from_text(text, folder=tmp_path), [np.arange(2)])
     assert cells.columns["detection"][0].tolist() == [
-        DetectionStatus.detected, DetectionStatus.failed,
-    ]
+        DetectionStatus.detected, DetectionStatus.failed]
     (failure,) = cells.failures
     assert told in failure.text.splitlines()[-1]
 

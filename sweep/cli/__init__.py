@@ -24,6 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments
         The words after ``sweep`` on the command line; by default this process'.
     """
+    command.hold_streams()
     command.accept_any_text()
     command.quiet_matplotlib()
     (parser, _), session = build_parser(), command.SESSION

@@ -295,6 +295,17 @@ def command_line() -> str:
     return quoted("sweep", *SESSION.given)
 
 
+def hold_streams() -> None:
+    """Open the null device where a standard stream is closed: no file or socket gets its number.
+
+    What libraries and plug-ins print there would be among what is read from that.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115
+
+
 def accept_any_text() -> None:
     """Print characters that the encoding of the terminal lacks as escapes, instead of failing."""
     for stream in (sys.stdout, sys.stderr):

@@ -14,12 +14,7 @@ from sweep.errors import MachineFaultError
 from sweep.execution.block_task import compute_block
 from sweep.experiment.grid import Block
 
-PIPELINE = """
-[pose]
-jitter_px = 0.5
-[axes]
-side_px = [20, 40]
-"""
+PIPELINE = "[pose]\njitter_px = 0.5\n[axes]\nside_px = [20, 40]\n"
 
 READERS = (["status"], ["verify"], ["repro"], ["report"], ["tradeoff", "--seconds", "1"])
 
@@ -65,23 +60,17 @@ def test_a_place_without_a_store_is_told_as_what_it_is_by_every_command(place, f
         PLACES[place])
 
 
-@pytest.mark.parametrize(
-    ("place", "problem"),
-    [
-        ("small.toml/s.zarr", "cannot be written: Not a directory"),
-        *((place, PLACES[place]) for place in (
-            "loop.zarr", "file:/a/b.zarr", "memory://x.zarr", "~/x.zarr")),
-        ("http://127.0.0.1:9/x.zarr", "cannot be reached"),
-        ("http://127.0.0.1:99999/x.zarr", "cannot be reached"),
-        ("zip://a/x.zarr", "zip://a/x.zarr: "),
-        ("small.toml", "not a sweep store, but a pipeline file"),
-        ("group.zarr/deep/inner.zarr", "cannot be written: it is inside the store {}/group.zarr"),
-    ],
-    ids=lambda text: text[:20],
-)
-def test_a_place_that_cannot_be_written_is_refused_before_anything_starts(
-    place, problem, folder
-):
+@pytest.mark.parametrize(("place", "problem"), [
+    ("small.toml/s.zarr", "cannot be written: Not a directory"),
+    *((place, PLACES[place]) for place in (
+        "loop.zarr", "file:/a/b.zarr", "memory://x.zarr", "~/x.zarr")),
+    ("http://127.0.0.1:9/x.zarr", "cannot be reached"),
+    ("http://127.0.0.1:99999/x.zarr", "cannot be reached"),
+    ("zip://a/x.zarr", "zip://a/x.zarr: "),
+    ("small.toml", "not a sweep store, but a pipeline file"),
+    ("group.zarr/deep/inner.zarr", "cannot be written: it is inside the store {}/group.zarr"),
+], ids=lambda text: text[:20])
+def test_a_place_that_cannot_be_written_is_refused_before_anything_starts(place, problem, folder):
     group = Path("group.zarr")
     group.mkdir()
     (group / "zarr.json").write_text("{}")
@@ -131,6 +120,16 @@ def test_full_standard_output_is_told_in_one_line(unbuffered, monkeypatch):
     assert done.returncode == 1
     assert done.stderr == (
         "standard output cannot be written: No space left on device; free space on the disk\n")
+
+
+@pytest.mark.system
+def test_a_closed_stream_is_no_other_file(tmp_path):
+    (tmp_path / "print.py").write_text("import os\nos.write(2, b'lost')\nD = print\n")
+    for place, lines in (("print:D", 3), ("nothing:D", 0)):
+        done = subprocess.run(
+            ["sh", "-c", '"$0" -m sweep plugins "$1" 2>&-', sys.executable, place],
+            cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (len(done.stdout.splitlines()), done.stderr) == (lines, "")
 
 
 @pytest.mark.system

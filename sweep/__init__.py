@@ -26,7 +26,7 @@ from sweep.errors import (
     SweepError,
     path_of,
 )
-from sweep.execution.progress import Progress, RunOptions, taking_run_options
+from sweep.execution.progress import DEFAULTS, Progress, RunOptions, taking_run_options
 from sweep.isolation.child_process import Child
 from sweep.messages import notice
 from sweep.version import __version__
@@ -346,6 +346,8 @@ def compare(
     >>> found.data.detection_rate.values.tolist()  # photographs, simulated
     [1.0, 1.0]
     """
+    given = {"repeats": repeats, "store": store, **options, "progress": None}
+    usual = {"repeats": 1, "store": None, **DEFAULTS}
     library.output_file.figure_file(output)
     one, other = path_of("first", first), path_of("second", second)
     library.lifecycle.open_finished(one)
@@ -353,7 +355,6 @@ def compare(
         place = os.fspath(store or library.prepare.twin_store(one, other))
         twins(one, other, repeats=repeats, store=place, **options)
         other = place
-    elif store is not None or repeats != 1:
-        name, value = ("repeats", repeats) if store is None else ("store", store)
-        raise ArgumentError(name, value, "expected photographs and a TOML file to simulate")
+    elif unused := [name for name in given if given[name] != usual[name]]:
+        raise ArgumentError(unused[0], given[unused[0]], "expected photographs and a TOML file")
     return library.findings.compare(one, other, bins=bins or None, output=output)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import numbers
 import os
 import socket
@@ -68,11 +67,18 @@ class ArgumentError(SweepError, ValueError):
         return f"{self.argument}{given}: {self.problem}"
 
 
-def check_positive(argument: str, value: object, expected: str, *, whole: bool = False) -> None:
-    """Raise ArgumentError unless a value is a finite number above 0, or None."""
-    kind = numbers.Integral if whole else numbers.Real
-    if value is not None and not (isinstance(value, kind) and 0 < float(value) < math.inf):
-        raise ArgumentError(argument, value, expected)
+#: The most processes of a run: a number beyond is a mistake, for which no machine has the memory.
+MAX_WORKERS = 1000
+
+
+def check_positive(argument: str, value: Any, expected: str = "", most: int = 0) -> None:
+    """Raise ArgumentError unless a value is a number above 0, or None; whole if ``most`` is given.
+
+    Numbers of 1e300 and more are not finite here, as nowhere.
+    """
+    kind: Any = numbers.Integral if most else numbers.Real
+    if value is not None and not (isinstance(value, kind) and 0 < value <= (most or 1e300)):
+        raise ArgumentError(argument, value, expected or f"expected a whole number, 1 to {most:,}")
 
 
 def path_of(argument: str, given: object) -> str:

@@ -95,8 +95,8 @@ def test_progress_is_reported_to_a_function_or_in_lines(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("options", "expected"), [
-    ({"workers": 0}, "workers = 0: expected at least 1"),
-    ({"workers": 1.5}, "workers = 1.5: expected at least 1"),
+    ({"workers": 0}, "workers = 0: expected a whole number, 1 to 1,000"),
+    ({"workers": 1.5}, "workers = 1.5: expected a whole number, 1 to 1,000"),
     ({"store": 3}, "store = 3: expected a path or URL"),
     ({"time_limit_s": float("nan")}, "time_limit_s = nan: expected seconds above 0"),
     ({"scheduler": "nowhere"}, "scheduler = nowhere: expected an address such as tcp://"),
@@ -118,7 +118,7 @@ def test_arguments_that_cannot_be_are_value_errors_that_name_them(options, expec
     (sweep.limit, {"pipeline": FEW, "require": 3}, "require = 3: expected texts"),
     (sweep.limit, {"pipeline": FEW, "at_all": b"x"}, "at_all = b'x': expected texts"),
     (sweep.limit, {"pipeline": FEW, "settings": 3}, "settings = 3: expected texts"),
-    (sweep.limit, {"pipeline": FEW, "max_trials": b"x"}, "max_trials = b'x': expected at least 1"),
+    (sweep.limit, {"pipeline": FEW, "max_trials": b"x"}, "max_trials = b'x': expected a whole"),
     (sweep.fit, {"markers": "x"}, "markers = x: expected a whole number from 1 to 1000"),
 ])
 def test_answers_refuse_other_types_by_name(function, arguments, expected):

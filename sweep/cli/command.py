@@ -209,8 +209,8 @@ def precision_settings(precision: Sequence[str], max_trials: int | None) -> list
     """
     widths = []
     for text in precision:
-        name, equals, width = (part.strip() for part in text.partition("="))
-        if not equals or not name.isidentifier() or not width:
+        name, _, width = (part.strip() for part in text.partition("="))
+        if not name.isidentifier() or not re.fullmatch(r"[\d.eE+-]+ *%?", width):
             raise ArgumentError(
                 "precision", text,
                 "expected a quantity and the half-width of its interval, such as "

@@ -17,7 +17,7 @@ import sweep
 from sweep import library
 from sweep.cli import command as cli
 from sweep.cli.command import Names, Numbers
-from sweep.errors import ArgumentError, check_positive
+from sweep.errors import MAX_WORKERS, ArgumentError, check_positive
 from sweep.isolation.child_process import Child, default_workers
 from sweep.messages import plain, quoted
 
@@ -187,7 +187,7 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
     ArgumentError
         If there are no workers.
     """
-    check_positive("workers", workers, "expected at least 1", whole=True)
+    check_positive("workers", workers, most=MAX_WORKERS)
     costs = library.forecast
     with Child() as child:
         timing = costs.measure(child, pipeline)
@@ -481,7 +481,8 @@ def verify(
         cli.SESSION.stopped = cli.CONTINUES
         report = library.verification.repair(store, sample, workers=workers)
     else:
-        check_positive("workers", workers, "expected at least 1", whole=True)
+        if workers is not None:
+            raise ArgumentError("workers", workers, "expected --repair, which alone uses them")
         report = library.verification.verify(store, sample)
     lines, damaged = [], report.damage
     for what, damages in (("repaired", report.repaired), ("damaged", damaged)):

@@ -23,7 +23,7 @@ from jinja2 import Template
 from numpy.typing import NDArray
 from rich import filesize
 
-from sweep.errors import RunError, StoreError, check_positive
+from sweep.errors import MAX_WORKERS, RunError, StoreError, check_positive
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SceneBatch, common_windows, scenes_at, searched_windows
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
@@ -397,13 +397,13 @@ def export(
     Raises
     ------
     ArgumentError
-        If ``workers`` is below 1.
+        If ``workers`` is not from 1 to 1,000.
     StoreError
         If the folder holds something else, or cannot be written, or there is too much to write.
     RunError
         If an image cannot be rendered, or a process that renders is ended.
     """
-    check_positive("workers", workers, "expected at least 1", whole=True)
+    check_positive("workers", workers, most=MAX_WORKERS)
     target = Path(folder)
     count = len(pipeline.experiment.all_scenes)
     parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]

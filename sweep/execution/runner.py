@@ -17,7 +17,7 @@ from sweep.evaluation.block import try_plugins
 from sweep.execution import forecast, progress, status
 from sweep.execution.executors import Children, Executor, Failed
 from sweep.execution.waves import InWaves
-from sweep.experiment.grid import TRIAL
+from sweep.experiment.grid import MAX_VALUES, TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import NO_TRIALS, search_settings
@@ -99,7 +99,7 @@ def execute(
     workers, time_limit_s = options["workers"], options["time_limit_s"]
     scheduler, client = options["scheduler"], options["client"]
     reuse, overwrite = options["reuse"], options["overwrite"]
-    errors.check_positive("workers", workers, "expected at least 1", whole=True)
+    errors.check_positive("workers", workers, most=errors.MAX_WORKERS)
     if scheduler is not None and client is not None:
         raise errors.ArgumentError("scheduler", scheduler, "expected no client beside it")
     errors.check_positive("time_limit_s", time_limit_s, "expected seconds above 0")
@@ -386,7 +386,7 @@ def limit(
     """
     from sweep.analysis.requirements import requirement_limits  # noqa: PLC0415  (slow to import)
 
-    errors.check_positive("max_trials", max_trials, "expected at least 1", whole=True)
+    errors.check_positive("max_trials", max_trials, most=MAX_VALUES)
     chosen = [*errors.texts_of("settings", settings),
               *search_settings(require, along, per, at_all, max_trials)]
     if isinstance(pipeline, (str, os.PathLike)) and lifecycle.names_store(pipeline):

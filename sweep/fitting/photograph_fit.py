@@ -161,7 +161,7 @@ def photograph_views(pipeline: Pipeline, most: int = MARKERS) -> tuple[Views, li
             views[number] = markers
     if not views:
         raise ArgumentError("folders", *(
-            ("white at level 255",
+            (str(Path(pipeline.folder, record.paths[0]).parent),
              "white is saturated in all photographs: expose less, so that levels are seen")
             if count else
             ("no marker", "expected photographs of markers of at least 12 px a side")

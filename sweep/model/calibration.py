@@ -156,10 +156,10 @@ class _Entry(NamedTuple):
 
     def pixels(self) -> int:
         """Return a side of a frame."""
-        (number,), _ = self.numbers()
-        if number != int(number) or not 1 <= number <= 100_000:
-            raise self.fault(f"{number:g}; expected whole pixels, from 1 to 100000")
-        return int(number)
+        numbers, _ = self.numbers()
+        if len(numbers) != 1 or not 1 <= numbers[0] <= 100_000 or numbers[0] % 1:
+            raise self.fault(f"{plain(self.value)}; expected whole pixels, from 1 to 100000")
+        return int(numbers[0])
 
     def numbers(self) -> tuple[list[float], tuple[int, ...] | None]:
         """Return a list's or a matrix' numbers, row by row, and its shape if it has one."""
@@ -169,7 +169,7 @@ class _Entry(NamedTuple):
                 raise self.fault("a matrix without data")
             if "rows" in value and "cols" in value:
                 sides = [_Entry(f"{self.name}.{key}", value[key]) for key in ("rows", "cols")]
-                shape = tuple(int(side.numbers()[0][0]) for side in sides)
+                shape = tuple(int(each) for side in sides for each in side.numbers()[0])
             # Digits enough for single precision stand for a number of single precision.
             value, single = value["data"], value.get("dt") == "f"
         if isinstance(value, str):

@@ -88,6 +88,8 @@ def write_errors_explained(path: Path) -> Iterator[None]:
     """Turn errors of a disk, and of a name that no path can have, into a StoreError."""
     try:
         yield
+    except BrokenPipeError:  # whoever reads wants no more, as of all that is printed
+        raise
     except (OSError, ValueError) as error:
         raise StoreError(f"{plain(path, 300)}: cannot be written: {reason_of(error)}") from None
 

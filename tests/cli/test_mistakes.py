@@ -38,29 +38,30 @@ def folder(stores, monkeypatch):
 
 
 @pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize(
-    ("line", "hint"),
-    [
-        ("runn small.toml", "did you mean run?"),
-        ("run small.toml tilt_deg=3", "did you mean --set tilt_deg=3?"),
-        ("plan small.toml --worker-count 2", "did you mean --workers?"),
-        ("run runs", "runs: not a sweep store; choose another path"),
-        ("show small.toml -o cell.jpg", "--output cell.jpg: expected a file that ends in .png"),
-        ("repro runs/small.zarr --at side_px=31", "not on the grid; its values are 30.0, 60.0"),
-        ("repro small.toml", "`sweep run small.toml` makes its store"),
-        ("status small", "did you mean runs/small.zarr?"),
-        ("size small.toml", "expected what is chosen: [search] smallest = "),
-        ("reference tilt", "did you mean tilt_deg?"),
-        ("compare runs/small.zarr runs/small.zarr --repeats -1", "--repeats -1: expected photogr"),
-        ("report runs/small.zarr -o report.pdf", "expected a file that ends in .html or .md"),
-        ("report runs/unfinished.zarr", "unfinished: 1 of 1 blocks; `sweep run` continues it"),
-        ("tradeoff runs/small.zarr --criterion rotation_p95", "did you mean rotation_p95_deg?"),
-        ("run small.toml --retry-failed --reuse runs/small.zarr", "expected no retry_failed"),
-        ("run small.toml --set trial=5", "run PIPELINE --store NEW --reuse runs/small.zarr`"),
-        ("tradeoff runs/small.zarr --seconds nan", "--seconds nan: expected a finite number ab"),
-        ("run few.toml --precision 'detection_rate = 0.1'", "expected max_trials, too: the most"),
-    ],
-)
+@pytest.mark.parametrize(("line", "hint"), [
+    ("runn small.toml", "did you mean run?"),
+    ("run small.toml tilt_deg=3", "did you mean --set tilt_deg=3?"),
+    ("plan small.toml --worker-count 2", "did you mean --workers?"),
+    ("run runs", "runs: not a sweep store; choose another path"),
+    ("show small.toml -o cell.jpg", "--output cell.jpg: expected a file that ends in .png"),
+    ("repro runs/small.zarr --at side_px=31", "not on the grid; its values are 30.0, 60.0"),
+    ("repro small.toml", "`sweep run small.toml` makes its store"),
+    ("status small", "did you mean runs/small.zarr?"),
+    ("size small.toml", "expected what is chosen: [search] smallest = "),
+    ("reference tilt", "did you mean tilt_deg?"),
+    ("compare runs/small.zarr runs/small.zarr --repeats -1", "--repeats -1: expected photogr"),
+    ("compare runs/small.zarr runs/small.zarr --workers 2", "--workers 2: expected photographs"),
+    ("run small.toml --workers 9999999999999999999", "expected a whole number, 1 to 1,000"),
+    ("verify runs/small.zarr --workers 2", "--workers 2: expected --repair, which alone"),
+    ("run few.toml --precision a=b", "--precision a=b: expected a quantity and the half-width"),
+    ("report runs/small.zarr -o report.pdf", "expected a file that ends in .html or .md"),
+    ("report runs/unfinished.zarr", "unfinished: 1 of 1 blocks; `sweep run` continues it"),
+    ("tradeoff runs/small.zarr --criterion rotation_p95", "did you mean rotation_p95_deg?"),
+    ("run small.toml --retry-failed --reuse runs/small.zarr", "expected no retry_failed"),
+    ("run small.toml --set trial=5", "run PIPELINE --store NEW --reuse runs/small.zarr`"),
+    ("tradeoff runs/small.zarr --seconds nan", "--seconds nan: expected a finite number ab"),
+    ("run few.toml --precision 'detection_rate = 0.1'", "expected max_trials, too: the most"),
+])
 def test_a_mistake_is_refused_with_what_to_change(line, hint):
     code, out, err = command(*shlex.split(line))
     assert (code, out) == (2, "")
@@ -69,19 +70,16 @@ def test_a_mistake_is_refused_with_what_to_change(line, hint):
 
 
 @pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize(
-    ("line", "following"),
-    [
-        ("run small.toml", "sweep report runs/small.zarr"),
-        ("plan small.toml --set trial=1", "sweep run small.toml --set trial=1"),
-        ("repro runs/small.zarr --at trial=1",
-         "sweep repro runs/small.zarr --at side_px=30.0,solver=ippe_square,trial=1 -o scene.png"),
-        ("status runs/unfinished.zarr", "sweep run runs/unfinished.zarr"),
-        ("verify runs/small.zarr --sample 0", "sweep report runs/small.zarr"),
-        ("report runs/small.zarr", "sweep tradeoff runs/small.zarr"),
-        ("tradeoff runs/small.zarr --seconds 0.1", "sweep report runs/small.zarr"),
-    ],
-)
+@pytest.mark.parametrize(("line", "following"), [
+    ("run small.toml", "sweep report runs/small.zarr"),
+    ("plan small.toml --set trial=1", "sweep run small.toml --set trial=1"),
+    ("repro runs/small.zarr --at trial=1",
+     "sweep repro runs/small.zarr --at side_px=30.0,solver=ippe_square,trial=1 -o scene.png"),
+    ("status runs/unfinished.zarr", "sweep run runs/unfinished.zarr"),
+    ("verify runs/small.zarr --sample 0", "sweep report runs/small.zarr"),
+    ("report runs/small.zarr", "sweep tradeoff runs/small.zarr"),
+    ("tradeoff runs/small.zarr --seconds 0.1", "sweep report runs/small.zarr"),
+])
 def test_every_command_ends_with_what_to_do_next(line, following, monkeypatch):
     if line.startswith("report"):
         monkeypatch.setattr(Figure, "savefig", lambda *_, **__: None)

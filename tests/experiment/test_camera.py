@@ -286,6 +286,8 @@ REFUSED = {
     "fisheye": (GOOD + "fisheye_model: 1\n", "a fisheye model: not supported"),
     "no size": (damaged(damaged(GOOD, "image_width", "a"), "image_height", "b"),
                 "expected width_px and height_px beside it: c.any does not say which frame size"),
+    "no width": (damaged(GOOD, "image_width: ", "image_width: [] #"), "[]; expected whole pixels"),
+    "empty rows": (damaged(GOOD, "rows: 3", "rows: []"), "3, but 9 numbers; is it cut short?"),
     "twice": (GOOD + "image_width: 800\n", "it has the key image_width twice"),
     "a tag": ("!!python/object/apply:os.system ['true']\n", "not a camera file"),
     "billion laughs": (

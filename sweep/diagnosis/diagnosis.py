@@ -15,22 +15,10 @@ from sweep.report.figure import Figure, write_figure
 from sweep.report.output_file import figure_file
 from sweep.report.table import UNDECIDED, Column, Findings, Table, Value, number
 
-# Causes in the table and in the figure.
+# Causes in the table and in the figure, of those with a posterior probability of 0.001.
 SHOWN = 6
 
-# Posterior probability from which on a cause is shown.
-LEAST_SHARE = 0.001
-
-# Squared misfit beyond the number of rows, in units of its standard deviation sqrt(2 d), at which
-# even the likeliest cause does not explain the rows: (misfit - d)² > 16 * 2 d.
-SURPRISING = 16.0
-
-# Mean log-likelihood of yaws, relative to those said, below which they are not explained: off by
-# 2.8 standard deviations.
-SURPRISING_YAW = -3.9
-
 UNEXPLAINED = "No known cause explains these rows"
-
 
 def diagnose(
     observations: str | os.PathLike[str] | Mapping[str, Sequence[Any]], *,
@@ -84,7 +72,7 @@ def diagnose(
         observations, camera=camera, size_m=size_m, dictionary=dictionary, refinement=refinement,
         zero_sd_m=zero_sd_m, compared=compared)
     ranked = inference.rank(rows)
-    shown = [each for each in ranked[:SHOWN] if each.probability >= LEAST_SHARE] or ranked[:1]
+    shown = [each for each in ranked[:SHOWN] if each.probability >= 0.001]
     if figure is not None:
         write_figure([residual_figure(shown)], figure)
     first, open_ = ranked[0], inference.rivals(ranked)
@@ -116,14 +104,12 @@ def diagnose(
             "misfit": float(each.misfit[0]), "test": each.words("test", "; "),
             "predicted_m": each.fitted} for each, size in zip(shown, sizes, strict=True)],
         "cannot_tell": [each.words("name") for each in (first, *open_)] if open_ else [],
-        "measure_next": None if measurement is None else measurement._asdict(),
+        "measure_next": measurement,
         "measured_m": value, "row": row + 1, "component": components,
         "notes": list(rows.notes), "not_looked_for": missing,
     }
-    lines = [f"note: {note}" for note in rows.notes]
-    if missing:
-        lines.append("not looked for: " + "; ".join(
-            f"{title} (needs {lack})" for title, lack in missing.items()))
+    lines = [*(f"note: {note}" for note in rows.notes), *(
+        f"not looked for: {title} (needs {lack})" for title, lack in missing.items())]
     return Findings([causes, tests, predictions, *lines, sentence], numbers,
                     status=0 if numbers["decided"] else UNDECIDED)
 
@@ -139,47 +125,44 @@ def size_of(each: inference.Explanation, rows: Observations) -> str:
             f"said is {ratio / (1.0 + spread * mean):.4g} times the truth "
             f"(± {100.0 * spread * sd:.2g} %)" if spread else
             f"{f'{axis} ' * (len(columns) > 1)}{scale * mean:+.2f} ± {scale * sd:.2g} {unit}"
-            for axis, _, (mean, sd) in zip("xyz", columns, numbers, strict=False)]
+            * bool(unit) for axis, _, (mean, sd) in zip("xyz", columns, numbers, strict=False)]
         if way["label"][0]:  # of a dozen units that fit, the three likeliest are named
             sizes.append(" or ".join(dict.fromkeys(filter(None, way["label"][:3]))))
-        if sizes:
+        if sizes := [*filter(None, sizes)]:
             texts.append(f"{cause.name}: " * (len(each.causes) > 1) + ", ".join(sizes))
     return "; ".join(texts)
 
 
 def _sentence(
     rows: Observations, first: inference.Explanation, open_: Sequence[inference.Explanation],
-    measurement: inference.Measurement | None,
+    measurement: Mapping[str, Any] | None,
 ) -> str:
     """Return the answer in one sentence, with what to do."""
-    misfit, test = float(first.misfit[0]), first.words("test", "; ")
-    count = len(rows.cells[0])
-    if misfit - count > np.sqrt(2.0 * SURPRISING * count) or (
-            first.yaw_evidence < SURPRISING_YAW * np.isfinite(rows.yaw_off[:, 0]).sum()):
-        return (f"{UNEXPLAINED}: look for a mistaken row, a distortion that the camera's "
-                "file lacks, or a wrong sign of yaw_deg, or state larger standard deviations.")
+    test, size, count = first.words("test", "; "), size_of(first, rows), (
+        len(rows.cells[0]) + np.isfinite(rows.yaw_off[:, 0]).sum())
+    # Even the likeliest does not explain rows that misfit by 4 standard deviations.
+    if (inference.ROWS in first.names and not open_) or (
+            float(first.misfit[0]) - count > 4.0 * np.sqrt(2.0 * count)):
+        return (f"{UNEXPLAINED} (nearest: {first.words('name')}{', ' + size if size else ''}): "
+                "measure again what stands apart, look for a wrong sign of yaw_deg, or state "
+                "larger standard deviations.")
     if not first.names and (rows.side_px < inference.SIDE_LIMITS_PX[0]).any():
         return ("What was said agrees with what was measured, but no detector reads a square of "
                 f"{rows.side_px.min():.2g} px: are size_m and all distances in metres?")
     if not first.names:
         return "All agrees with what is expected: nothing is wrong that these rows could show."
     if measurement is None:
-        size = size_of(first, rows)
         return f"It is {first.words('title')}{': ' + size if size else ''}. To be sure: {test}."
     names = [first.words("name"), *(each.words("name") for each in open_)]
-    confounded = {"size", "focal_length"} <= set(names) and not np.isfinite(
-        rows.measured[:, :2]).any()
-    between = f"Cannot tell between {', '.join(names[:-1])} and {names[-1]}: " + (
-        "size and focal length are confounded, distances show their product alone; "
-        if confounded else "")
-    if measurement.difference < inference.DECIDES:
-        return (f"{between}no further row of this kind would decide (at best "
-                f"{measurement.difference:.1f} standard deviations); {test}.")
+    between = (f"Cannot tell between {', '.join(names[:-1])} and {names[-1]}, confounded in these "
+               "rows: ")
+    if measurement["difference"] < inference.DECIDES:
+        return f"{between}no further row of this kind would decide; {test}."
     what = {"distance": "the straight distance", "x": "x, to the right of the optical axis",
-            "z": "z, along the optical axis"}[measurement.component]
-    return (f"{between}measure {what} at {number(measurement.distance_m)} m, "
-            f"{measurement.bearing_deg:.0f} degrees off the axis, where {names[0]} and {names[1]} "
-            f"differ by {measurement.difference:.1f} standard deviations; or {test}.")
+            "z": "z, along the optical axis"}[measurement["component"]]
+    return (f"{between}measure {what} at {number(measurement['distance_m'])} m, "
+            f"{measurement['bearing_deg']:.0f} degrees off the axis, where {names[0]} and "
+            f"{names[1]} differ by {measurement['difference']:.1f} standard deviations; or {test}.")
 
 
 def residual_figure(shown: Sequence[inference.Explanation]) -> Figure:

@@ -8,12 +8,12 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sweep.diagnosis.observations import Observations, tape_sd
+from sweep.diagnosis.observations import SOLVED_YAW_SD_DEG, Observations, tape_sd
 from sweep.model.marker import module_count, overhang
 from sweep.typing import Floats
 
@@ -25,50 +25,57 @@ from sweep.typing import Floats
 # Relative standard deviation of a named ratio: by how much prints and rulers are off.
 NAMED_SD = 0.01
 
-# Standard deviations of ln(ratio): of a print or a calibration that is a little off, and of one
-# that is wrong altogether.
-SMALL_SD, FREE_SD = 0.03, 0.35
+# Standard deviation of ln(ratio) of a print or a calibration that is a little off.
+SMALL_SD = 0.03
 
-# Distance of the middles of ln(ratio) from one another.
-STEP = 0.06
-
-# Middles of ln(ratio) of sizes left at a default, and their spread.
-FAR = np.arange(1.6, 3.7, 0.4)
-FAR_SD = 0.25
+# Half widths at half maximum of ln(ratio) of a size and a focal length that are wrong altogether:
+# sizes are left at defaults, lenses are not ten times as long.
+SIZE_WIDTH, FOCAL_WIDTH = 0.35, 0.2
 
 # Ratios of units that are taken for one another: mm, cm, m; inch and mm, cm; foot, inch and m.
-INCH = 25.4
-UNITS = (10.0, 100.0, 1000.0, INCH, INCH / 10.0, 1.0 / 0.3048, 1000.0 / INCH)
+UNITS = (10.0, 100.0, 1000.0, 25.4, 2.54, 1.0 / 0.3048, 1000.0 / 25.4)
 
 # Ratios of resolutions, of crops and of binning: 1920 for 960, 1280, 1440 and 640, and back.
 FOCAL_RATIOS = {
     each: f"calibrated at {each:.3g} times the resolution (another mode, crop or binning)"
     for each in (2.0, 0.5, 1.5, 2 / 3, 4 / 3, 0.75, 3.0, 1 / 3)}
 
+# Distortions that a camera's file lacks: the image at the tangent r from the axis belongs at
+# r exp(b r²), and k1 = -b.
+BENDS = np.concatenate([np.geomspace(0.02, 0.6, 20), -np.geomspace(0.02, 0.25, 15)])
+
+# By which share of their distance rows may be off that no cause explains.
+SCATTERS = (0.03, 0.1, 0.3, 1.0)
 
 # A way in which a cause is undone: logarithm of its prior probability; said position to true one,
 # at the middle of the prior; how many times too large what was said is, there; standard deviation
-# of ln(ratio) about it, 0 if there is no ratio; how many times larger the square is in the image
-# than f size / z of what was said; its name, empty if the ratio may be anything.
+# of ln(ratio) about it, 0 if there is no ratio; its name, empty if the ratio may be anything; by
+# how much an ignored distortion moves the image at 45 degrees from the axis; the row, counted from
+# 1, that is off by anything, 0 for all rows, -1 for all along the line of sight; by which share of
+# its distance.
 Ways = NDArray[np.void]
 WAY = np.dtype([
     ("log_weight", np.float64), ("matrix", np.float64, (3, 3)), ("ratio", np.float64),
-    ("spread", np.float64), ("square", np.float64), ("label", np.str_, 80)])
+    ("spread", np.float64), ("label", np.str_, 80), ("bend", np.float64), ("row", np.int64),
+    ("scatter", np.float64)])
 
 
 def ways_of(
-    matrix: Floats, label: Sequence[str] = ("",), weight: ArrayLike = 1.0,
-    ratio: ArrayLike = 1.0, spread: ArrayLike = 0.0, square: ArrayLike = 1.0, share: float = 1.0,
+    matrix: Floats, label: Sequence[str] = ("",), weight: ArrayLike = 1.0, share: float = 1.0,
+    **fields: ArrayLike,
 ) -> Ways:
     """Return the ways (c,) of one cause of matrices (c, 3, 3); a number stands for all of them.
 
-    They have a ``share`` of the cause's prior.
+    They have a ``share`` of the cause's prior. Without ``fields`` they have a ratio of 1, and
+    neither spread, bend nor scatter.
     """
     ways = np.zeros(len(matrix), WAY)
-    ways["matrix"], ways["ratio"], ways["spread"], ways["square"] = matrix, ratio, spread, square
+    ways["matrix"], ways["ratio"] = matrix, 1.0
     ways["log_weight"] = np.log(weight)
     ways["log_weight"] += math.log(share) - np.logaddexp.reduce(ways["log_weight"])
     ways["label"][: len(label)] = label
+    for name, values in fields.items():
+        ways[name] = values
     return ways
 
 
@@ -98,6 +105,9 @@ class Cause:
         What observations lack for it to be looked for, empty if nothing.
     unit
         Prior standard deviation of the columns' numbers in this unit, and the unit.
+    yaws
+        Prior shares (m, 3) of yaws that are as said, mirrored, or anything, each as likely: a wrong
+        sign mirrors all. A marker seen from behind or turned by 180 degrees is another mistake.
     """
 
     name: str
@@ -108,25 +118,25 @@ class Cause:
     columns: Callable[[Observations, Floats, Floats], Sequence[Floats]] = lambda *_: ()
     lacks: Callable[[Observations], str] = lambda _: ""
     unit: tuple[float, str] = (1.0, "")
+    yaws: ArrayLike = ((0.99, 0.0, 0.01),)
 
 
 def ratios(
-    named: Mapping[float, str], share: float, axes: Sequence[float], far_share: float = 0.0
+    named: Mapping[float, str], share: float, width: float, axes: Sequence[float]
 ) -> Ways:
-    """Return ways of a ratio: ``named`` ones, together ``share``, near 1, any, or far from 1.
+    """Return ways of a ratio: ``named`` ones, together ``share``, near 1, or any.
 
-    The said positions are that many times too long along ``axes`` (3,), 1 or 0 each.
+    ln(ratio) that may be any is Cauchy's with ``width``, whose tails are wide. The said positions
+    are that many times too long along ``axes`` (3,), 1 or 0 each.
     """
-    middles = np.arange(-24, 25) * STEP
-    density = np.exp(-0.5 * (middles / FREE_SD) ** 2)
-    far = np.concatenate([FAR, -FAR]) if far_share else np.zeros(0)
-    free = 1.0 - share - far_share
+    middles = width * np.sinh(np.arange(-25, 26) * 0.115)
+    spacing = np.gradient(middles)
+    density = spacing / (1.0 + (middles / width) ** 2)
     log_ratio, weight, spread = np.concatenate([np.broadcast_arrays(*group) for group in (
-        (np.log(list(named)), share / len(named), NAMED_SD), ([0.0], 0.6 * free, SMALL_SD),
-        (middles, 0.4 * free * density / density.sum(), 0.6 * STEP),
-        (far, far_share / max(len(far), 1), FAR_SD))], axis=1)
+        (np.log(list(named)), share / len(named), NAMED_SD), ([0.0], 0.6 * (1.0 - share), SMALL_SD),
+        (middles, 0.4 * (1.0 - share) * density / density.sum(), 0.6 * spacing))], axis=1)
     matrix = np.eye(3) * np.exp(-np.outer(log_ratio, axes))[:, None, :]
-    return ways_of(matrix, [*named.values()], weight, np.exp(log_ratio), spread)
+    return ways_of(matrix, [*named.values()], weight, ratio=np.exp(log_ratio), spread=spread)
 
 
 def size_ratios(dictionary: str) -> dict[float, str]:
@@ -151,18 +161,13 @@ def size_ratios(dictionary: str) -> dict[float, str]:
     return found
 
 
-# What is in other units: its name, the powers of the ratio in x, y and z and in the side of the
-# square in the image over f size / z, and its prior share.
-UNIT_KINDS = (
-    # As long as it is itself, such a size makes tvec; so does a tape in other units.
-    ("size_m (or the tape, inversely)", (1, 1, 1), 0, 0.45), ("tvec", (1, 1, 1), 1, 0.45),
-    ("tvec_z_m alone", (0, 0, 1), 1, 0.09), ("tvec_x_m and tvec_y_m", (1, 1, 0), 0, 0.01))
-
-
 def _unit_ways(rows: Observations) -> Ways:
-    ratio = np.array([unit**sign for unit in UNITS for sign in (1, -1)])
-    parts = []
-    for name, powers, larger, share in UNIT_KINDS:
+    """Return what is in other units: the size, all that is said, or its z alone."""
+    ratio, parts = np.array([unit**sign for unit in UNITS for sign in (1, -1)]), []
+    for name, powers, larger, share in (
+            # As long as it is itself, such a size makes tvec; so does a tape in other units.
+            ("size_m (or the tape, inversely)", (1, 1, 1), 0, 0.45),
+            ("tvec", (1, 1, 1), 1, 0.45), ("tvec_z_m alone", (0, 0, 1), 1, 0.1)):
         # No detector reads a square that would be larger than the image, or a few pixels.
         side = np.outer(ratio**larger, rows.side_px)
         unread = rows.known_square & (side != np.clip(side, *SIDE_LIMITS_PX)).any(axis=1)
@@ -170,7 +175,7 @@ def _unit_ways(rows: Observations) -> Ways:
             np.eye(3) / (ratio[:, None] ** powers)[:, None], [
                 f"{name} {'longer' if each > 1 else 'shorter'} by {max(each, 1 / each):.4g}"
                 for each in ratio],
-            np.where(unread, 1e-6, 1.0), ratio, NAMED_SD, ratio**larger, share))
+            np.where(unread, 1e-6, 1.0), share, ratio=ratio, spread=NAMED_SD))
     return np.concatenate(parts)
 
 
@@ -189,16 +194,31 @@ def _focal_ways(rows: Observations) -> Ways:
     (u - c) / f and should be (u - c / r) r / f: x + (1 - 1 / r) z c / f is true, and z / r, or z if
     the image is a crop.
     """
-    alone, ratio = ratios(FOCAL_RATIOS, 0.4, (0, 0, 1)), np.array([*FOCAL_RATIOS])
+    alone, ratio = (
+        ratios(FOCAL_RATIOS, 0.4, FOCAL_WIDTH, (0, 0, 1)), np.array([*FOCAL_RATIOS]))
     if rows.camera is None or not rows.lateral:
         return alone
     crop = _moved_centre(rows, np.outer(
         1.0 - 1.0 / ratio, [rows.camera.cx_px, rows.camera.cy_px]))
-    alone["log_weight"] += math.log(0.7)
+    alone["log_weight"] += math.log(0.5)
     resized = alone["matrix"][: len(ratio)] @ crop
     return np.concatenate([
-        alone, ways_of(resized, [*FOCAL_RATIOS.values()], 1.0, ratio, NAMED_SD, share=0.2),
-        ways_of(crop, [*FOCAL_RATIOS.values()], spread=NAMED_SD, share=0.1)])
+        alone, ways_of(
+            resized, [*FOCAL_RATIOS.values()], share=0.2, ratio=ratio, spread=NAMED_SD),
+        ways_of(crop, [*FOCAL_RATIOS.values()], share=0.1, spread=NAMED_SD),
+        ways_of(np.tile(np.eye(3), (len(BENDS), 1, 1)),
+                ["a distortion that the camera's file lacks"] * len(BENDS), share=0.2, bend=BENDS)])
+
+
+def _scattered(rows: Observations) -> Ways:
+    """Return what explains anything, badly: one row is off, each as likely, or all of them are."""
+    # Pairs with each of more rows would take gigabytes.
+    lone = range(1, 1 + len(rows.said)) if len(rows.said) <= 40 else ()
+    whose = np.repeat([-1, 0, *lone], len(SCATTERS))
+    return ways_of(np.tile(np.eye(3), (len(whose), 1, 1)), [
+        f"row {k} stands apart" if k > 0 else "all rows are off" for k in whose],
+        np.where(whose > 0, 2.0 / len(rows.said), 1.0),
+        row=whose, scatter=np.resize(SCATTERS, len(whose)))
 
 
 def along_sight(points: Floats) -> Floats:
@@ -252,14 +272,15 @@ def _scaled(_: Observations, points: Floats, spread: Floats) -> Sequence[Floats]
 
 # All causes; prior weights follow how often public questions turned out to be each.
 AGREE = "agree"
-FLIPS = "flips"
+ROWS = "rows"
 STRAIGHT = "z_for_range"
 FOCAL = "focal_length"
 CAUSES = (
     Cause(AGREE, "the numbers agree with what is expected", 4.0, "nothing to test"),
     Cause("size", "wrong size of the marker (another edge, or a scaled or bent print)", 3.0,
           "measure the square whose corners are detected with a caliper, flat on a table",
-          lambda rows: ratios(size_ratios(rows.dictionary), 0.6, (1, 1, 1), 0.05), _scaled),
+          lambda rows: ratios(size_ratios(rows.dictionary), 0.6, SIZE_WIDTH, (1, 1, 1)),
+          _scaled),
     Cause(FOCAL, "wrong focal length (resolution, another camera, crop, autofocus)", 2.5,
           "photograph a ruler in the middle and at the edge: f is its pixels times distance / "
           "length; if they differ, give the lens' distortion; compare image sizes with the file's",
@@ -282,9 +303,7 @@ CAUSES = (
           _lateral, (TURN_SD_DEG, "degrees to turn")),
     Cause("half_pixel", "half a pixel (convention of corners or calibration)", 0.7,
           "detect a rendered marker whose corners are known (`sweep export`)",
-          lambda rows: ways_of(_moved_centre(rows, np.array([[0.5, 0.5], [-0.5, -0.5]])), [
-              f"pixels' centres counted from {one} in one place, from {other} in the other"
-              for one, other in (("0.5", "0"), ("0", "0.5"))]),
+          lambda rows: ways_of(_moved_centre(rows, np.array([[0.5, 0.5], [-0.5, -0.5]]))),
           lacks=lambda rows: _lateral(rows) or _known_square(rows)),
     Cause("refinement", "bias of the corner refinement", 1.0,
           "run the other refinement on the same images: its bias differs",
@@ -296,10 +315,13 @@ CAUSES = (
               DELAY_SD_S * np.nan_to_num(rows.speed)[:, None] * along_sight(points)],
           lacks=lambda rows: "" if np.nan_to_num(rows.speed).any() else "speed_m_s",
           unit=(1e3 * DELAY_SD_S, "ms late")),
-    Cause(FLIPS, "flips (the mirrored solution of the plane)", 0.5,
+    Cause("flips", "flips (the mirrored solution of the plane)", 0.5,
           "print both solutions of solvePnPGeneric with their reprojection errors",
           lacks=lambda rows: "" if np.isfinite(rows.yaw_off).any()
-          else "yaw_deg and rvec_x, rvec_y, ..."),
+          else "yaw_deg and rvec_x, rvec_y, ...", yaws=((0.495, 0.495, 0.01),)),
+    Cause(ROWS, "no cause of this list (a mistaken row, a camera that moved or refocused)", 1.0,
+          "measure again: a mistaken row changes, a cause stays", _scattered,
+          yaws=((0.5, 0.0, 0.5), (0.0, 0.99, 0.01))),
 )
 
 # Prior weight of two causes at once, relative to one.
@@ -315,12 +337,6 @@ CLEAR_ODDS = 20.0
 # Sides between which the refinement's bias and noise are expected.
 SIDE_LIMITS_PX = (8.0, 2000.0)
 
-# Prior share of rows that are flipped, where flips are the cause.
-FLIP_SHARE = 0.5
-
-# Standard deviation of an estimated yaw.
-ROTATION_SD_DEG = 3.0
-
 
 @dataclass(frozen=True)
 class Explanation:
@@ -334,7 +350,8 @@ class Explanation:
         Logarithm of the prior weight times the marginal likelihood.
     misfit
         Squared distance (c,) of what was measured from the prediction of each way in which they
-        are undone, the likeliest first, in standard deviations, with all that is unknown.
+        are undone, the likeliest first, in standard deviations, with all that is unknown; and minus
+        twice the log-likelihood of the yaws, relative to yaws as they were said.
     way
         The likeliest way of each cause, and after it those that are not told from it.
     numbers, covariance
@@ -342,8 +359,6 @@ class Explanation:
         deviations: the causes' own first, then bias and zero points.
     fitted, residuals
         Expected readings of the tape (d,), and what they leave, in standard deviations.
-    yaw_evidence
-        Log-likelihood of the measured yaws, relative to yaws as they were said.
     probability
         Posterior probability among all explanations.
     """
@@ -356,7 +371,6 @@ class Explanation:
     covariance: Floats
     fitted: Floats
     residuals: Floats
-    yaw_evidence: float
     probability: float = math.nan
 
     @property
@@ -380,22 +394,31 @@ def predict(
     Notes
     -----
     A plane through an image's ray at the angle b to the axis is shown larger by 1 / cos b across,
-    and by 1 / cos² b away from the axis. So a solver that believes another lens, and another b,
-    finds a marker parallel to the image where the way says, and others nearer or farther by up to
-    the ratio of both cosines, as they are tilted, which is not known: half of it, with that
-    standard deviation, is expected.
+    and by 1 / cos² b away from the axis. So a solver that believes another lens, and another ray,
+    finds a marker parallel to the image where the way says, and others nearer or farther as they
+    are tilted, which is not known. With the rays' unit vectors (x, y, z) both stretches differ by
+    the complex number a = [(x + iy)² - (x' + iy')²] / 2, nearly; half of the ratio of both cosines
+    is expected, and ± 0.5 |a|: the rest was within 0.6 |a| of cv2.projectPoints and IPPE. A
+    distortion exp(b r²) of the image's radius r enlarges it by b r² across and by 3 b r² away from
+    the axis: (1.6 ± 0.6) b r² was found for tilts up to 40 degrees.
     """
     bias, bias_sd, noise, lateral = rows.expected
     row, component = rows.cells
     points = np.einsum("cij,nj->cni", undone(ways), rows.said)
-    square = np.prod([each["square"] for each in ways], axis=0)[:, None]
-    side = np.clip(rows.side_px * square, *SIDE_LIMITS_PX)[..., None]
+    side = np.clip(rows.side_px, *SIDE_LIMITS_PX)[:, None]
     lens = undone([way for way, cause in zip(ways, causes, strict=True) if cause.name == FOCAL])
     # In other axes z is no depth: no lens of a pinhole camera sees beyond 60 degrees.
-    true, believed = (np.maximum(along_sight(each)[..., 2:], 0.5) for each in (
-        points, points @ np.linalg.inv(lens).transpose(0, 2, 1)))
-    slant = 0.5 * np.log(believed / true)
-    points = points * np.exp(slant) * (1.0 - bias / side)
+    rays = [along_sight(each) for each in (
+        points, points @ np.linalg.inv(lens).transpose(0, 2, 1))]
+    true, believed = (np.maximum(ray[..., 2:], 0.5) for ray in rays)
+    first, second = ((ray[..., :1] + 1j * ray[..., 1:2]) ** 2 for ray in rays)
+    bend, alone, scatter = (
+        np.sum([each[name] for each in ways], axis=0)[:, None]
+        for name in ("bend", "row", "scatter"))
+    bend = bend[..., None] * (believed**-2 - 1.0)
+    points = points * np.sqrt(believed / true) * np.exp(-bend * [0.6, 0.6, 1.6]) * (
+        1.0 - bias / side)
+    slant = np.hypot(0.25 * np.abs(first - second), 0.6 * bend)
     sight = along_sight(points)
     # Change of what is measured with the position: a component, or along the line of sight.
     # The tape is straight; who finds z wrong has compared z with it, if no cause explains it.
@@ -409,14 +432,16 @@ def predict(
     # Each measured component has a zero point of its own.
     seen += [np.broadcast_to(rows.zero_sd_m * (component == k), seen[0].shape)
              for k in np.unique(component)]
-    # Noise grows with the distance as measured: with that of the points a factor that brings them
-    # near would explain many rows by less noise.
-    known = np.fmax(rows.measured[:, 3], rows.measured[:, 2])
-    distance = np.where(np.isfinite(known), np.abs(known), np.linalg.norm(points, axis=-1))[:, row]
+    # Noise grows with distance. By that of the points alone, a factor that brings them near would
+    # explain many rows by less noise.
+    known = np.abs(np.nan_to_num(np.fmax(rows.measured[:, 3], rows.measured[:, 2])))
+    reach = np.maximum(known, np.linalg.norm(points, axis=-1))[:, row]
     across = lateral / (rows.camera.fx_px if rows.camera is not None else 1000.0)
     along = (onto * sight[:, row]).sum(axis=-1)
-    variance = rows.measured_sd[row, component] ** 2 + distance**2 * (
-        along**2 * ((noise / side) ** 2 + slant**2)[:, row, 0] + (1.0 - along**2) * across**2)
+    apart = np.where(alone < 0, along**2, (alone == 0) | (alone == row + 1))
+    variance = rows.measured_sd[row, component] ** 2 + reach**2 * (
+        along**2 * ((noise / side) ** 2 + slant**2)[:, row, 0] + (1.0 - along**2) * across**2
+        + scatter**2 * apart)
     return (points[:, row] * onto).sum(axis=-1), np.stack(seen, axis=-1), variance
 
 
@@ -445,42 +470,45 @@ def explain(rows: Observations, causes: tuple[Cause, ...], log_prior: float) -> 
     misfit = (left**2 / variance).sum(axis=-1) + (numbers**2).sum(axis=-1)
     joint = sum(each["log_weight"] for each in ways) - 0.5 * (
         misfit + np.log(2.0 * math.pi * variance).sum(axis=-1) + np.log(precision).sum(axis=-1))
-    yaw = _yaw_evidence(rows, FLIP_SHARE if any(cause.name == FLIPS for cause in causes) else 0.0)
+    yaw = _yaw_evidence(rows, causes[-1])  # causes that change them are the last
     likeliest = np.argsort(-joint, kind="stable")
     near, k = likeliest[joint[likeliest] > joint.max() - math.log(CLEAR_ODDS)], likeliest[0]
     return Explanation(
-        causes, float(np.logaddexp.reduce(joint)) + log_prior + yaw, misfit[likeliest],
+        causes, float(np.logaddexp.reduce(joint)) + log_prior + yaw,
+        misfit[likeliest] - 2.0 * yaw,
         [each[near] for each in ways], numbers[k], covariance[k],
-        mean[k] + columns[k] @ numbers[k], left[k] / np.sqrt(variance[k]), yaw)
+        mean[k] + columns[k] @ numbers[k], left[k] / np.sqrt(variance[k]))
 
 
-def _yaw_evidence(rows: Observations, flipped_share: float) -> float:
-    """Return the log-likelihood of the measured yaws: each as said, or as said or mirrored.
+def _yaw_evidence(rows: Observations, cause: Cause) -> float:
+    """Return the log-likelihood of the measured yaws by a cause's shares.
 
     It is relative to that of a yaw as it was said, which is the same for all causes.
     """
     known = np.isfinite(rows.yaw_off[:, 0])
-    spread = np.hypot(rows.yaw_sd, ROTATION_SD_DEG)[known, None]
+    spread = np.hypot(rows.yaw_sd, SOLVED_YAW_SD_DEG)[known, None]
     off = (rows.yaw_off[known] + 180.0) % 360.0 - 180.0
-    # A marker seen from behind or turned by 180 degrees is some other mistake: no tail is thinner
-    # than a uniform share of 1 %.
-    likelihood = 0.99 * np.exp(-0.5 * (off / spread) ** 2) + 0.01 / 360.0 * (
-        spread * math.sqrt(2.0 * math.pi))
-    return float(np.log(likelihood @ [1.0 - flipped_share, flipped_share]).sum())
+    likelihood = np.hstack([
+        np.exp(-0.5 * (off / spread) ** 2), spread * math.sqrt(2.0 * math.pi) / 360.0])
+    total = np.log(likelihood @ np.transpose(cause.yaws)).sum(axis=0)
+    return float(np.logaddexp.reduce(total)) - math.log(len(total))
 
 
 def rank(rows: Observations) -> list[Explanation]:
     """Return all explanations of observations, by posterior probability."""
     found = [cause for cause in CAUSES if not cause.lacks(rows)]
     total = sum(cause.prior for cause in found)
-    paired = [cause for cause in found if cause.name not in {AGREE, "units", STRAIGHT}]
+    # Units of z alone beside a focal length would be any focal length.
+    pairs = [pair for pair in itertools.combinations(found, 2)
+             if not {cause.name for cause in pair} & {AGREE, STRAIGHT}
+             and {cause.name for cause in pair} != {"units", FOCAL}]
     explanations = [
         # Who finds z wrong, and compared it with a straight tape, has made that mistake, too.
         explain(rows, causes, math.log(
             PAIRS_PRIOR ** (len(causes) - 1 + (
                 straight_differs(rows) and causes[0].name not in {AGREE, STRAIGHT}))
             * math.prod(cause.prior / total for cause in causes)))
-        for causes in [*((cause,) for cause in found), *itertools.combinations(paired, 2)]]
+        for causes in [*((cause,) for cause in found), *pairs]]
     evidence = np.array([each.log_evidence for each in explanations])
     share = np.exp(evidence - np.logaddexp.reduce(evidence))
     return [dataclasses.replace(explanations[k], probability=float(share[k]))
@@ -497,59 +525,40 @@ def rivals(ranked: Sequence[Explanation]) -> list[Explanation]:
 # --------------------------------------------------------------------------------------------------
 # The next measurement: where two explanations differ most, in standard deviations.
 
-# Angles of a new marker to the optical axis.
-DIRECTIONS_DEG = (0.0, 20.0)
-
-# Sides of the square, in pixels and as a share of the frame's height, at which it is measured.
-FEWEST_PX, MOST_SHARE = 20.0, 0.6
+# Angle of a new marker to the optical axis.
+BEARING_DEG = 20.0
 
 # Difference in standard deviations from which on one more row is worth taking.
 DECIDES = 2.0
 
 
-class Measurement(NamedTuple):
-    """A row to measure next.
+def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> dict[str, Any]:
+    """Return the row at which two explanations differ most relative to their uncertainty.
 
-    Attributes
-    ----------
-    distance_m, bearing_deg
-        Where the marker is to stand.
-    component
-        The measured component: "distance" along the line of sight, "x" to the right, "z" along
-        the axis.
-    difference
-        Difference of both predictions, in standard deviations.
+    Returns
+    -------
+    dict
+        ``distance_m`` and ``bearing_deg``, where the marker is to stand; ``component``, which is
+        "distance" along the line of sight, "x" to the right or "z" along the axis; and the
+        ``difference`` of both predictions, in standard deviations.
     """
-
-    distance_m: float
-    bearing_deg: float
-    component: str
-    difference: float
-
-
-def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> Measurement:
-    """Return the row at which two explanations differ most relative to their uncertainty."""
     undo = undone(a.way)[0]
     reach = np.linalg.norm(rows.said @ undo.T, axis=1)
-    near, far = reach.min() / 3.0, reach.max() * 3.0
+    distance = np.geomspace(reach.min() / 3.0, reach.max() * 3.0, 30)
     if rows.camera is not None and rows.known_square:
         focal_size = float(np.median(reach * rows.side_px))  # as the image shows it
-        near = max(near, focal_size / (
-            MOST_SHARE * (rows.camera.height_px or 2.0 * rows.camera.cy_px)))
-        far = max(min(far, focal_size / FEWEST_PX), near * 1.5)
-    bearing, distance = (each.ravel() for each in np.meshgrid(
-        np.radians(DIRECTIONS_DEG), np.geomspace(near, far, 15), indexing="ij"))
-    truth = distance[:, None] * np.stack(
-        [np.sin(bearing), np.zeros_like(bearing), np.cos(bearing)], axis=-1)
+        # The square's side is measured from 20 px to 60 % of the frame's height.
+        distance = focal_size / np.clip(focal_size / distance, 20.0, 1.2 * rows.camera.cy_px)
+    bearing = math.radians(BEARING_DEG)
+    truth = np.outer(distance, [math.sin(bearing), 0.0, math.cos(bearing)])
     # The program's answer if a were right.
     said = truth @ np.linalg.inv(undo).T
-    unknown = np.full((len(said), 2), np.nan)
     new = dataclasses.replace(
-        rows, said=said, lateral=True, yaw_off=unknown, yaw_sd=unknown[:, 0],
-        measured=np.column_stack([truth[:, 0], unknown[:, 0], truth[:, 2], distance]),
-        measured_sd=np.tile(tape_sd(distance), (4, 1)).T,
+        rows, said=said, measured_sd=np.tile(tape_sd(distance), (4, 1)).T,
+        measured=np.column_stack([truth[:, 0], distance * np.nan, truth[:, 2], distance]),
         speed=np.full(len(said), np.nanmean([*rows.speed, 0.0])))
     row, which = new.cells
+    # A new row counts as apart, too, where an old one of its number does: those beside it decide.
     means, variances = [], []
     for each in (a, b):
         # The unknown zero points are those of the new row alone where it measures a new component.
@@ -565,6 +574,6 @@ def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> Meas
     enough = difference >= min(float(difference.max()), 2.0 * DECIDES)
     effort = np.abs(np.log(distance[row] / np.median(reach)))
     k = int(np.argmin(np.where(enough, effort, np.inf)))
-    return Measurement(
-        float(distance[row[k]]), float(np.degrees(bearing[row[k]])),
-        ("x", "y", "z", "distance")[which[k]], float(difference[k]))
+    return {
+        "distance_m": float(distance[row[k]]), "bearing_deg": BEARING_DEG,
+        "component": ("x", "y", "z", "distance")[which[k]], "difference": float(difference[k])}

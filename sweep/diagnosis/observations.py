@@ -59,8 +59,8 @@ TAPE_SD_M, TAPE_SHARE = 0.002, 0.005
 # Standard deviation of the tape's zero point: where the lens' centre lies in its housing.
 ZERO_SD_M = 0.01
 
-# Standard deviation of a marker's yaw measured by eye and of one that was estimated.
-YAW_SD_DEG = 5.0
+# Standard deviations of a marker's yaw measured by eye and of one that was estimated.
+YAW_SD_DEG, SOLVED_YAW_SD_DEG = 5.0, 3.0
 
 # Refinement -> bias of the range, its spread, its noise, and the centre's noise, in pixels: the
 # range is off by these pixels / side of the square. Medians of
@@ -78,7 +78,7 @@ UNKNOWN_REFINEMENT = (0.4, 0.6, 0.6, 0.3)
 UNKNOWN_SIDE_PX = 80.0
 
 # Rows that are judged within ten seconds and a gigabyte.
-MAX_ROWS = 200
+MAX_ROWS = 150
 
 
 # Settings of `sweep diagnose`.

@@ -50,7 +50,8 @@ def test_on_the_axis_they_are_confounded_and_a_row_off_it_would_decide():
 @pytest.mark.parametrize(("said", "tape", "words"), [
     (1.003 * AWAY, AWAY, "nothing is wrong"), (1003 * AWAY, 1000 * AWAY, "in metres?"),
     (1.003 * np.linspace(0.5, 2, 100), np.linspace(0.5, 2, 100), "nothing is wrong"),
-    (1e6 * AWAY, AWAY / 3, "No known cause")])
+    (1e6 * AWAY, AWAY / 3, "No known cause"),
+    (AWAY, AWAY * [1, 1.3, 1], "No known cause explains these rows (nearest: rows, row 2")])
 def test_rows_that_agree_or_that_nothing_explains_are_said_to(said, tape, words):
     found = sweep.diagnose({"range_m": said, "tape_m": tape}, camera=CAMERA, size_m=0.1)
     assert (words in found.numbers["sentence"], found.status) == (True, 3 * ("No" in words))
@@ -72,15 +73,18 @@ def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
     assert "\n" not in str(error.value)
 
 
-def test_tilted_markers_corners_in_an_image_of_another_resolution_show_it():
+@pytest.mark.parametrize(("f", "u", "v", "k1", "words"), [
+    (600, 426, 239.5, 0, "calibrated at 1.5 times the resolution"),
+    (900, 639.5, 359.5, -0.3, "a distortion that the camera's file lacks")])
+def test_tilted_markers_corners_show_another_resolution_or_lens(f, u, v, k1, words):
     square = 0.05 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0.0]])
-    turn, frame = np.array([2.4, 0.6, 0.3]), np.array([[600, 0, 426], [0, 600, 239.5], [0, 0, 1]])
-    places = np.array([[0.1, 0.05, 0.6], [-0.3, 0, 1.2], [0.4, 0.2, 1.5], [0, -0.2, 1.9]])
-    corners = [cv2.projectPoints(square, turn, place, frame, None)[0].ravel() for place in places]
-    columns = {**dict(zip(CORNERS, np.transpose(corners), strict=True)),
-               "tape_m": np.linalg.norm(places, axis=1)}
-    found = sweep.diagnose(columns, camera=CAMERA, size_m=0.1, dictionary="DICT_5X5_50").numbers
-    assert "calibrated at 1.5 times the resolution" in found["sentence"]
+    turn, frame = np.array([2.4, 0.6, 0.3]), np.array([[f, 0, u], [0, f, v], [0, 0, 1]])
+    places = np.array([[0.1, 0.05, 0.6], [-0.3, 0, 1.2], [0.6, 0.2, 1.2], [0, -0.2, 1.9]])
+    columns = {"tape_m": np.linalg.norm(places, axis=1)} | dict(zip(CORNERS, np.transpose([
+        cv2.projectPoints(square, turn, place, frame, np.array([k1, 0, 0, 0.0]))[0].ravel()
+        for place in places]), strict=True))
+    found = sweep.diagnose(columns, camera=CAMERA, size_m=0.1, compared="range")
+    assert words in found.numbers["sentence"]
 
 
 def test_poses_are_solved_from_images(tmp_path):

@@ -139,8 +139,9 @@ def _sentence(
 ) -> str:
     """Return the answer in one sentence, with what to do."""
     test, size, count = first.words("test", "; "), size_of(first, rows), (
-        len(rows.cells[0]) + np.isfinite(rows.yaw_off[:, 0]).sum())
-    # Even the likeliest does not explain rows that misfit by 4 standard deviations.
+        len(rows.cells[0]) + 3 * np.isfinite(rows.yaw_off[:, 0]).sum())
+    # Even the likeliest does not explain rows that misfit by 4 standard deviations. A yaw that may
+    # be mirrored is expected to cost 1 + 2 ln 2.
     if (inference.ROWS in first.names and not open_) or (
             float(first.misfit[0]) - count > 4.0 * np.sqrt(2.0 * count)):
         return (f"{UNEXPLAINED} (nearest: {first.words('name')}{', ' + size if size else ''}): "

@@ -474,10 +474,8 @@ def fit_photograph(
         (3,) the parameters at which it starts.
     """
     own, shared = np.arange(ALL) < OWN, start.copy()
-    starts = [
-        np.concatenate([np.zeros(CORNERS), [black, white - black], shared])
-        for black, white in (np.quantile(each.levels, START_SHARES) for each in markers)
-    ]
+    levels = [np.quantile(each.levels, START_SHARES) for each in markers]
+    starts = [np.array([*[0.0] * CORNERS, low, high - low, *shared]) for low, high in levels]
     states = _good([
         fitted_state(marker, start, np.append(own[:OWN], moved))
         for marker, start in zip(markers, starts, strict=True)

@@ -94,6 +94,8 @@ class FittedPose(NamedTuple):
         (n, 2) px of all points.
     used
         (n,) which points are no outliers.
+    shift_px
+        By how much the edges of black squares lie outwards.
     """
 
     rotation: Floats
@@ -101,6 +103,7 @@ class FittedPose(NamedTuple):
     covariance: Floats
     residuals: Floats
     used: Masks
+    shift_px: float
 
     @property
     def rms_px(self) -> float:
@@ -110,7 +113,7 @@ class FittedPose(NamedTuple):
 
 def fit_pose(
     camera: Calibration, points: Floats, pixels: Floats, rotation: Floats, translation: Floats,
-    used: Masks | None = None,
+    used: Masks | None = None, outward: Floats | None = None,
 ) -> FittedPose | None:
     """Return the pose of least squares from a start; None without 4 points, or if it diverges.
 
@@ -128,11 +131,14 @@ def fit_pose(
         The start.
     used
         (n,) the points to use.
+    outward
+        (n, 2) px by which the points move if edges move outwards by 1 px: that shift is fitted, too
+        (:class:`sweep.photographs.folder.FoundCorners`).
     """
     if used is None:
         used = np.ones(len(points), dtype=bool)
         for _ in range(2):
-            pose = fit_pose(camera, points, pixels, rotation, translation, used)
+            pose = fit_pose(camera, points, pixels, rotation, translation, used, outward)
             if pose is None:
                 return None
             rotation, translation = pose.rotation, pose.translation
@@ -144,23 +150,27 @@ def fit_pose(
         return None
     for _ in range(MAX_STEPS):
         image, design, _ = derivatives(camera, points[used], rotation, translation)
+        if outward is not None:
+            design = np.column_stack([design, outward[used].ravel()])
         residual = (pixels[used] - image).ravel()
         if not (np.isfinite(design).all() and np.isfinite(residual).all()):
             return None
         step = np.asarray(np.linalg.lstsq(design, residual, rcond=None)[0], dtype=np.float64)
         rotation = rotation_of_vector(step[None, :3])[0] @ rotation
-        translation = translation + step[3:]
+        translation = translation + step[3:6]
         if not translation[2] > 0:
             return None
-        shift = np.linalg.norm(step[3:]) / np.linalg.norm(translation)
-        if np.linalg.norm(step[:3]) < CONVERGED and shift < CONVERGED:
-            normal = design.T @ design
+        moved = np.linalg.norm(step[3:6]) / np.linalg.norm(translation)
+        if np.linalg.norm(step[:3]) < CONVERGED and moved < CONVERGED:
+            normal, left = design.T @ design, residual - design @ step
             if np.linalg.cond(normal) > 1e18:
                 return None
-            variance = float(residual @ residual) / max(len(residual) - 6, 1)
-            covariance = np.asarray(variance * np.linalg.inv(normal), dtype=np.float64)
+            variance = float(left @ left) / max(len(left) - len(step), 1)
+            covariance = np.asarray(variance * np.linalg.inv(normal)[:6, :6], dtype=np.float64)
             residuals = derivatives(camera, points, rotation, translation)[0] - pixels
-            return FittedPose(rotation, translation, covariance, residuals, used)
+            shift_px = 0.0 if outward is None else float(step[6])
+            residuals += shift_px * (0.0 if outward is None else outward)
+            return FittedPose(rotation, translation, covariance, residuals, used, shift_px)
     return None
 
 
@@ -169,35 +179,26 @@ def fitted_board(camera: Calibration, found: FoundCorners) -> FittedPose | None:
     if len(found.points) < MIN_CORNERS:
         return None
     guard = GuardedPoints.of(found.points, found.pixels, cameras_of(camera, 1))
-    starts = guard.poses(cv2.SOLVEPNP_IPPE)
-    fits = [fit_pose(camera, found.points, found.pixels, *start) for start in starts]
+    fits = [fit_pose(camera, found.points, found.pixels, *start, outward=found.outward)
+            for start in guard.poses(cv2.SOLVEPNP_IPPE)]
     good = [fit for fit in fits if fit is not None and fit.used.sum() >= MIN_CORNERS]
     return min(good, key=lambda fit: float(np.median((fit.residuals**2).sum(axis=1))), default=None)
 
 
-# --------------------------------------------------------------------------------------------------
-# Edges of black squares that are shifted: cameras blur light before they make levels of it, so that
-# black looks smaller, and ink spreads. Each marker is smaller then, around its own centre, as no
-# change of the pose or of the camera has it. In rendered photographs of a grid, with gamma,
-# denoising, sharpening and JPEG, edges are shifted by 0.3 px: poses beside a calibration from these
-# photographs were off by 0.15 % of the range and 0.06 degrees, and are by 0.04 % and 0.007 degrees.
-
-#: Rounds in which a shift is estimated beside the pose, which takes up less than half of it, and
-#: rounds of that and of a calibration.
-SHIFT_ROUNDS, CALIBRATIONS = 8, 3
+#: Rounds of a calibration and of the shifts of edges beside it, which take up little of each other.
+CALIBRATIONS = 3
 
 
 def unshifted(camera: Calibration, found: FoundCorners) -> FoundCorners:
-    """Return a board's corners in a photograph without the shift of edges beside its pose."""
-    pose = fitted_board(camera, found)
-    for _ in range(SHIFT_ROUNDS):
-        if pose is None or found.outward is None:
-            break
-        outward = found.outward * pose.used[:, None]
-        shift = (pose.residuals * outward).sum() / (outward**2).sum()
-        found = found._replace(pixels=found.pixels + shift * found.outward)
-        pose = fit_pose(camera, found.points, found.pixels, *pose[:2], pose.used)
-    return found
+    """Return a board's corners in a photograph without the shift of edges beside its pose.
+
+    Cameras blur light before they make levels of it, so that black looks smaller, and ink spreads.
+    Each marker is smaller then, around its own centre, as no pose or camera has it. In rendered
+    photographs of a grid edges were shifted by 0.3 px, by gamma, denoising, sharpening and JPEG.
+    """
+    if found.outward is None or (pose := fitted_board(camera, found)) is None:
+        return found
+    return found._replace(pixels=found.pixels - pose.shift_px * found.outward)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -343,7 +344,8 @@ def check_resolution(
     fault = _rms_fault(rms_px, size)
     if rms_px >= DOUBTFUL_PX:
         least, scale = min(
-            (_median_rms(scaled(camera, float(each)), found), each) for each in SCALES)
+            (_median_rms(scaled(camera, float(each)), found[:: 1 + len(found) // 20]), each)
+            for each in SCALES)
         if least < CLEARLY_BETTER * rms_px:
             fault = (
                 f"the board's corners are {rms_px:.2g} px RMS beside it, and {least:.2g} px if its "

@@ -185,7 +185,7 @@ def detect_markers(
 # homography says where they are about, and ``cv2.cornerSubPix`` measures them. So are the markers'
 # corners of a board with black squares at them, whose outlines run together with the markers': a
 # detector's corners may be off by pixels. Of other boards they are the markers' corners, as OpenCV
-# refines them; all edges are shifted there, which `sweep.photographs.cameras.unshifted` takes back.
+# refines them; all edges are shifted there, which `sweep.photographs.cameras.fit_pose` estimates.
 
 #: Markers whose corners give the homography around a corner of the chessboard.
 NEIGHBOURS = 4
@@ -414,9 +414,7 @@ def fitting_share(board: Board, seen: Sequence[SeenMarkers]) -> float:
     fitting = 0
     for flat, quads, side_px in _flat_markers(board, seen, 2):
         transform, _ = cv2.findHomography(
-            flat.reshape(-1, 2), quads.reshape(-1, 2), cv2.RANSAC,
-            FITTING_SHARE * side_px / 2,
-        )
+            flat.reshape(-1, 2), quads.reshape(-1, 2), cv2.RANSAC, FITTING_SHARE * side_px / 2)
         if transform is None:
             continue
         mapped = cv2.perspectiveTransform(flat.reshape(1, -1, 2), transform).reshape(-1, 4, 2)
@@ -429,7 +427,8 @@ def measured_side(board: Board, seen: Sequence[SeenMarkers]) -> float:
     """Return the side of the markers over the board's, by the distances of their centres."""
     ratios: list[float] = []
     for flat, quads, _ in _flat_markers(board, seen, 4):
-        transform, _ = cv2.findHomography(quads.mean(axis=1), flat.mean(axis=1))
+        transform, _ = cv2.findHomography(
+            quads.mean(axis=1), flat.mean(axis=1), cv2.RANSAC, np.ptp(flat[0], axis=0).max() / 4)
         if transform is None:
             continue
         back = cv2.perspectiveTransform(quads.reshape(1, -1, 2), np.asarray(transform))

@@ -186,9 +186,10 @@ def prepare(
     elif str(camera) != CALIBRATE:
         known = [cameras.camera_of_file(str(camera), first.size)]
     else:
+        straight = corners
         for _ in range(1 if corners[0].outward is None else cameras.CALIBRATIONS):
-            calibrated, line = cameras.calibrate(first.size, corners)
-            corners = [cameras.unshifted(calibrated, each) for each in corners]
+            calibrated, line = cameras.calibrate(first.size, straight)
+            straight = [cameras.unshifted(calibrated, each) for each in corners]
         known, lines = [calibrated], [*lines, line]
     described = json.dumps(document, sort_keys=True) if document else ""
     sizes_m = np.array(list(sizes.values()))
@@ -200,11 +201,12 @@ def prepare(
     if poses is not None:
         lines += poses_of_file(one, Path(poses))
     elif target is not None and (rig is None or one_camera):
-        corners = [cameras.unshifted(one.camera, each) for each in corners]
-        rms_px = board_poses(one, target, corners)
+        rms_px, shift_px = board_poses(one, target, corners)
         if rig is None and str(camera) != CALIBRATE:
             cameras.check_resolution(str(camera), one.camera, first.size, corners, rms_px)
-        lines.append(f"board: {rms_px:.2f} px RMS of its corners in the median photograph")
+        lines.append(f"board: {rms_px:.2f} px RMS of its corners in the median photograph" + (
+            f"; black squares' edges {shift_px:+.2f} px outwards (blur, ink, or a wrong marker_m)"
+            if shift_px else ""))
     elif rig is None:
         own_poses(one)
     else:
@@ -512,7 +514,7 @@ def _misplaced(side: Side) -> float | None:
 MIN_HALF = 5
 
 
-def board_poses(side: Side, board: Board, found: Sequence[FoundCorners]) -> float:
+def board_poses(side: Side, board: Board, found: Sequence[FoundCorners]) -> Floats:
     """Write the poses of a board's markers in photographs, of markers wholly in them.
 
     Where no marker is seen, such as in a blurred photograph, each detector misses all.
@@ -528,8 +530,9 @@ def board_poses(side: Side, board: Board, found: Sequence[FoundCorners]) -> floa
 
     Returns
     -------
-    float
-        The RMS in px of the corners of the median photograph, NaN if none has corners enough.
+    array
+        The RMS of the corners and the shift of edges (2,) in px of the median photograph, NaN if
+        none has corners enough.
     """
     camera, covariance = side.camera, cameras.covariance_of(side.camera)
     boards = [cameras.fitted_board(camera, each) for each in found]
@@ -549,7 +552,7 @@ def board_poses(side: Side, board: Board, found: Sequence[FoundCorners]) -> floa
             points = (corners.points - centre) @ axes
             fitted = fit_pose(
                 camera, points, corners.pixels, pose.rotation @ axes,
-                pose.rotation @ centre + pose.translation, without,
+                pose.rotation @ centre + pose.translation, without, corners.outward,
             ) if without.sum() >= cameras.MIN_CORNERS else None
             if fitted is None:
                 continue
@@ -561,7 +564,8 @@ def board_poses(side: Side, board: Board, found: Sequence[FoundCorners]) -> floa
                 )
             side.put((photograph, column[k]), fitted.rotation, fitted.translation,
                      TruthSource.board_without_this_marker, np.sqrt(variance))
-    return float(np.median([each.rms_px for each in boards if each is not None] or [np.nan]))
+    known = [(each.rms_px, each.shift_px) for each in boards if each is not None]
+    return np.asarray(np.median(known or [(np.nan, 0.0)], axis=0))
 
 
 def unshared_variance(
@@ -598,7 +602,7 @@ def _halves_ratio(
         first, centre = (corners.number // together) % 2 == 0, corners.points.mean(axis=0)
         one, other = (
             fit_pose(camera, corners.points - centre, corners.pixels, pose.rotation,
-                     pose.rotation @ centre + pose.translation, half & pose.used)
+                     pose.rotation @ centre + pose.translation, half & pose.used, corners.outward)
             if (half & pose.used).sum() >= MIN_HALF else None for half in (first, ~first)
         )
         if one is None or other is None:

@@ -17,7 +17,7 @@ def cases():
 def row(case, found):
     """Return a row of the guide's table."""
     causes = "; ".join(
-        f"{' and '.join(each['causes'])} {each['probability']:.2f}"
+        f"{' + '.join(each['causes'])} {each['probability']:.2f}"
         for each in found.numbers["causes"][:2])
     where = case["source"].split(" ")[0]
     name = "/".join(where.removesuffix("/").split("/")[2:])

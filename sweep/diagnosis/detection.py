@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -132,20 +131,21 @@ class DetectionModel:
             np.einsum("nk,kij->nij", basis, self.log_covariance), np.exp) @ turn.transpose(0, 2, 1)
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         bias = np.einsum("nij,nj->ni", turn, basis @ self.bias) + self.shift * _lengths(tvec[:, 2])
-        odds = hat_basis(at, self.flip_knots()) @ self.flips
+        odds = hat_basis(at, self.flip_knots) @ self.flips
         return xr.Dataset({
             "covariance": (("pose", "row", "column"), covariance, {"units": "m2, m rad, rad2"}),
             "bias": (("pose", "row"), bias, {"units": "m, radian"}),
             "flip_probability": ("pose", 1.0 / (1.0 + np.exp(-odds)), {"units": "1"}),
         }).where(xr.DataArray(known, dims="pose")).assign(known=("pose", known))
 
+    @property
     def flip_knots(self) -> list[Floats]:
-        """Return the knots of ambiguity, side and viewing angle of the flips."""
+        """Knots of ambiguity, side and viewing angle of the flips."""
         return [self.ambiguity_knots, self.side_knots[::3], self.angle_knots[[0, 2, 5]]]
 
     def to_json(self) -> str:
         """Return it as a JSON object: its attributes."""
-        return to_json(dataclasses.asdict(self))
+        return to_json(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> DetectionModel:
@@ -154,17 +154,23 @@ class DetectionModel:
         Raises
         ------
         DatasetError
-            If there are other attributes, shapes that do not fit, or knots that decrease.
+            If there are other attributes or shapes, numbers that are not finite, a focal size that
+            is not above 0, or knots that decrease.
         """
         try:
             model = cls(**json.loads(text, object_hook=lambda attributes: {
-                name: np.array(value)[()] for name, value in attributes.items()}))
-            model.at([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
-            for knots in (model.side_knots, model.angle_knots, model.ambiguity_knots):
-                if (np.diff(knots) < 0).any():
-                    raise ValueError("knots that decrease")
-        except (TypeError, ValueError, IndexError) as error:
-            raise DatasetError(f"not the JSON of a model: {error}; make it again") from None
+                name: np.array(value, np.float64)[()] for name, value in attributes.items()}))
+            values, k = [*vars(model).values()], math.prod(KNOTS)
+            shapes = [(), *((n,) for n in (*KNOTS, len(AMBIGUITY_SHARES), 6)), (k, 6), (k, 6, 6),
+                      (k,), (math.prod(map(len, model.flip_knots)),), ()]
+            right = [np.shape(value) for value in values] == shapes and model.focal_size_px_m > 0
+            right &= all(np.isfinite(value).all() for value in values)
+            right &= all((np.diff(knots) >= 0).all() for knots in values[1:4])
+        except (TypeError, ValueError, IndexError, OverflowError, RecursionError):
+            right = False
+        if not right:
+            raise DatasetError("not the JSON of a model of one detection, or damaged: make it "
+                               "again with `sweep.error_model(STORE).to_json()`")
         return model
 
 
@@ -227,25 +233,24 @@ def widened(model: DetectionModel, photographs: xr.Dataset) -> DetectionModel:
     covariance matrix estimation and implications for functional genomics", Stat. Appl. Genet. Mol.
     Biol. 4:32, 2005, target D). Errors within a photograph are not independent: r is a sum of one
     number for each photograph, and Var(r) the sum of their squares, about 0 and not about their
-    mean. Of n photographs this adds about (1 - s) / n to the paper's share. It is 1 of a single
-    one, where the paper's is not defined, and of a few no correlations are invented.
+    mean. With n photographs the share is therefore larger than the paper's, by about (1 - s) / n.
+    With a single photograph, for which the paper's share is not defined, it is 1 and no correlation
+    is kept; with a few photographs it is near 1 unless they agree.
     """
     for rounds_left in reversed(range(ROUNDS)):  # the truth's own errors are not multiplied
         found = judged(model, photographs).dropna("pose", subset=["whitened"])
         whitened = found["whitened"]
         if len(whitened) < MIN_PHOTOGRAPHED:
             raise DatasetError(
-                f"{len(whitened)} solved poses of photographs that are not flipped and that the "
-                f"simulation knows: factors need {MIN_PHOTOGRAPHED} or more; take more "
-                "photographs, or simulate their poses (`sweep.twins`)")
+                f"{len(whitened)} known poses of photographs: factors need {MIN_PHOTOGRAPHED} that "
+                "are not flipped; take more photographs, or simulate their poses (`sweep.twins`)")
         pairs = whitened * whitened.rename(row="column")
         products = pairs.groupby(found["trial"]).sum().values
         off_diagonal = products * (1.0 - np.eye(6))
         share = (off_diagonal**2).sum() / (off_diagonal.sum(axis=0) ** 2).sum()
         kept = 0.0 if rounds_left else max(1.0 - share, 0.0)
         moments = products.sum(axis=0) / len(whitened) * np.where(np.eye(6), 1.0, kept)
-        model = dataclasses.replace(
-            model, log_covariance=_stretched(model.log_covariance, moments))
+        model = replace(model, log_covariance=_stretched(model.log_covariance, moments))
     return model
 
 
@@ -324,7 +329,7 @@ def of_simulation(results: xr.Dataset) -> DetectionModel:
         focal_size, side, angle, ambiguity, shift, bias,
         log_covariance + wider[:, None, None] * np.eye(6), poses, np.zeros(0),
         float(bearing_of(tvec).max()))
-    return dataclasses.replace(model, flips=_flip_fit(at, flipped, model.flip_knots()))
+    return replace(model, flips=_flip_fit(at, flipped, model.flip_knots))
 
 
 def estimated(results: xr.Dataset) -> xr.Dataset:

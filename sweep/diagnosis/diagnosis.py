@@ -15,8 +15,8 @@ from sweep.report.figure import Figure, write_figure
 from sweep.report.output_file import figure_file
 from sweep.report.table import UNDECIDED, Column, Findings, Table, Value, number
 
-# Causes in the table and in the figure, of those with a posterior probability of 0.001.
-SHOWN = 6
+# Causes in the table and in the figure, and their least posterior probability.
+SHOWN, LEAST_SHARE = 6, 0.001
 
 UNEXPLAINED = "No known cause explains these rows"
 
@@ -72,17 +72,16 @@ def diagnose(
         observations, camera=camera, size_m=size_m, dictionary=dictionary, refinement=refinement,
         zero_sd_m=zero_sd_m, compared=compared)
     ranked = inference.rank(rows)
-    shown = [each for each in ranked[:SHOWN] if each.probability >= 0.001]
+    shown = [each for each in ranked[:SHOWN] if each.probability >= LEAST_SHARE]
     if figure is not None:
         write_figure([residual_figure(shown)], figure)
     first, open_ = ranked[0], inference.rivals(ranked)
     measurement = inference.next_measurement(rows, first, open_[0]) if open_ else None
     sentence = _sentence(rows, first, open_, measurement)
-    sizes = [size_of(each, rows) for each in shown]
     causes = Table.of(
         "Causes by posterior probability", ("cause", "probability", "misfit", "its size"),
-        [(each.words("name"), number(each.probability), number(each.misfit[0]), size)
-         for each, size in zip(shown, sizes, strict=True)], words=True)
+        [(each.words("name"), number(each.probability), number(each.misfit[0]),
+          size_of(each, rows)) for each in shown], words=True)
     tests = Table.of(
         "What they mean, and the test that decides", ("cause", "meaning", "test"),
         [(cause.name, cause.title, cause.test) for cause in dict.fromkeys(
@@ -99,10 +98,10 @@ def diagnose(
     numbers = {
         "sentence": sentence, "decided": not open_ and UNEXPLAINED not in sentence,
         "causes": [{
-            "causes": sorted(each.names) or [inference.AGREE], "title": each.words("title"),
-            "probability": each.probability, "size": size,
+            "causes": sorted(each.names) or [inference.AGREE], "size": size_of(each, rows),
+            "title": each.words("title", " and "), "probability": each.probability,
             "misfit": float(each.misfit[0]), "test": each.words("test", "; "),
-            "predicted_m": each.fitted} for each, size in zip(shown, sizes, strict=True)],
+            "predicted_m": each.fitted} for each in shown],
         "cannot_tell": [each.words("name") for each in (first, *open_)] if open_ else [],
         "measure_next": measurement,
         "measured_m": value, "row": row + 1, "component": components,
@@ -129,7 +128,8 @@ def size_of(each: inference.Explanation, rows: Observations) -> str:
         if way["label"][0]:  # of a dozen units that fit, the three likeliest are named
             sizes.append(" or ".join(dict.fromkeys(filter(None, way["label"][:3]))))
         if sizes := [*filter(None, sizes)]:
-            texts.append(f"{cause.name}: " * (len(each.causes) > 1) + ", ".join(sizes))
+            named = len(each.causes) > 1 and cause.name != inference.ROWS
+            texts.append(f"{cause.name}: " * named + ", ".join(sizes))
     return "; ".join(texts)
 
 
@@ -138,23 +138,25 @@ def _sentence(
     measurement: Mapping[str, Any] | None,
 ) -> str:
     """Return the answer in one sentence, with what to do."""
-    test, size, count = first.words("test", "; "), size_of(first, rows), (
-        len(rows.cells[0]) + 3 * np.isfinite(rows.yaw_off[:, 0]).sum())
+    test, size = first.words("test", "; "), size_of(first, rows)
+    names = [each.words("name").replace(inference.ROWS, "no listed cause")
+             for each in (first, *open_)]
+    count = len(rows.cells[0]) + 3 * np.isfinite(rows.yaw_off[:, 0]).sum()
     # Even the likeliest does not explain rows that misfit by 4 standard deviations. A yaw that may
     # be mirrored is expected to cost 1 + 2 ln 2.
     if (inference.ROWS in first.names and not open_) or (
             float(first.misfit[0]) - count > 4.0 * np.sqrt(2.0 * count)):
-        return (f"{UNEXPLAINED} (nearest: {first.words('name')}{', ' + size if size else ''}): "
-                "measure again what stands apart, look for a wrong sign of yaw_deg, or state "
-                "larger standard deviations.")
+        nearest = [f"nearest: {names[0]}"] * (first.names != {inference.ROWS})
+        return (f"{UNEXPLAINED} ({', '.join(filter(None, [*nearest, size]))}): measure again, look "
+                "for a wrong sign of yaw_deg, or state larger standard deviations.")
     if not first.names and (rows.side_px < inference.SIDE_LIMITS_PX[0]).any():
         return ("What was said agrees with what was measured, but no detector reads a square of "
                 f"{rows.side_px.min():.2g} px: are size_m and all distances in metres?")
     if not first.names:
         return "All agrees with what is expected: nothing is wrong that these rows could show."
     if measurement is None:
-        return f"It is {first.words('title')}{': ' + size if size else ''}. To be sure: {test}."
-    names = [first.words("name"), *(each.words("name") for each in open_)]
+        return (f"It is {first.words('title', ' and ')}{': ' + size if size else ''}. "
+                f"To be sure: {test}.")
     between = (f"Cannot tell between {', '.join(names[:-1])} and {names[-1]}, confounded in these "
                "rows: ")
     if measurement["difference"] < inference.DECIDES:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sweep.diagnosis.observations import SOLVED_YAW_SD_DEG, Observations, tape_sd
+from sweep.diagnosis.observations import REFINEMENTS, SOLVED_YAW_SD_DEG, Observations, tape_sd
 from sweep.model.marker import module_count, overhang
 from sweep.typing import Floats
 
@@ -378,7 +377,7 @@ class Explanation:
         """Names of the causes; empty if the numbers agree."""
         return frozenset(cause.name for cause in self.causes) - {AGREE}
 
-    def words(self, attribute: str, between: str = " and ") -> str:
+    def words(self, attribute: str, between: str = " + ") -> str:
         """Return the name, title or test of all causes."""
         return between.join(getattr(cause, attribute) for cause in self.causes)
 
@@ -402,7 +401,7 @@ def predict(
     distortion exp(b r²) of the image's radius r enlarges it by b r² across and by 3 b r² away from
     the axis: (1.6 ± 0.6) b r² was found for tilts up to 40 degrees.
     """
-    bias, bias_sd, noise, lateral = rows.expected
+    bias, bias_sd, noise, lateral = REFINEMENTS[rows.refinement]
     row, component = rows.cells
     points = np.einsum("cij,nj->cni", undone(ways), rows.said)
     side = np.clip(rows.side_px, *SIDE_LIMITS_PX)[:, None]
@@ -511,7 +510,7 @@ def rank(rows: Observations) -> list[Explanation]:
         for causes in [*((cause,) for cause in found), *pairs]]
     evidence = np.array([each.log_evidence for each in explanations])
     share = np.exp(evidence - np.logaddexp.reduce(evidence))
-    return [dataclasses.replace(explanations[k], probability=float(share[k]))
+    return [replace(explanations[k], probability=float(share[k]))
             for k in np.argsort(-evidence, kind="stable")]
 
 
@@ -553,7 +552,7 @@ def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> dict
     truth = np.outer(distance, [math.sin(bearing), 0.0, math.cos(bearing)])
     # The program's answer if a were right.
     said = truth @ np.linalg.inv(undo).T
-    new = dataclasses.replace(
+    new = replace(
         rows, said=said, measured_sd=np.tile(tape_sd(distance), (4, 1)).T,
         measured=np.column_stack([truth[:, 0], distance * np.nan, truth[:, 2], distance]),
         speed=np.full(len(said), np.nanmean([*rows.speed, 0.0])))

@@ -65,19 +65,19 @@ YAW_SD_DEG, SOLVED_YAW_SD_DEG = 5.0, 3.0
 # Refinement -> bias of the range, its spread, its noise, and the centre's noise, in pixels: the
 # range is off by these pixels / side of the square. Medians of
 # `pipelines/diagnose/refinements.toml` (36h11 and 4X4_50, sides 25 to 220 px, tilts to 60 degrees);
-# the spread is what photographs differ from it by (light, sharpening, tone).
+# the spread is what photographs differ from it by (light, sharpening, tone). Empty: unknown.
 REFINEMENTS: dict[str, tuple[float, float, float, float]] = {
     "none": (0.80, 0.30, 0.31, 0.19),
     "subpix": (0.35, 0.30, 0.12, 0.03),
     "contour": (1.07, 0.30, 0.17, 0.04),
     "apriltag": (0.02, 0.30, 0.06, 0.03),
+    "": (0.4, 0.6, 0.6, 0.3),
 }
 
 # Side of the square where neither camera nor size are known.
-UNKNOWN_REFINEMENT = (0.4, 0.6, 0.6, 0.3)
 UNKNOWN_SIDE_PX = 80.0
 
-# Rows that are judged within ten seconds and a gigabyte.
+# Most rows: this many take 6 s and 1.3 GB on one core of the build machine.
 MAX_ROWS = 150
 
 
@@ -182,11 +182,6 @@ class Observations:
         depth = np.maximum(self.said[:, 2], np.linalg.norm(self.said, axis=1) / 2.0)
         return np.asarray(self.camera.fx_px * self.size_m / depth)
 
-    @property
-    def expected(self) -> tuple[float, float, float, float]:
-        """Bias, its spread, noise and lateral noise, in pixels, of the refinement."""
-        return REFINEMENTS.get(self.refinement, UNKNOWN_REFINEMENT)
-
 
 def read_observations(
     source: str | os.PathLike[str] | Mapping[str, Sequence[Any]], *,
@@ -231,8 +226,7 @@ def read_observations(
               "axes expected x_m, y_m and z_m, too")
     _each_row(there[[*MEASURED, "yaw_deg"]].any(axis=1),
               "expected tape_m, or one of x_m, y_m, z_m: what was measured by tape")
-    _each_row(lateral | ~there[MEASURED[:2]].any(axis=1),
-              "x_m and y_m need tvec_x_m and tvec_y_m")
+    _each_row(lateral | ~there[MEASURED[:2]].any(axis=1), "x_m and y_m need tvec_x_m and tvec_y_m")
     measured = table[MEASURED].to_numpy()
     deviations = table[["position_sd_m"] * 3 + ["tape_sd_m"]].to_numpy()
     if not np.isfinite(deviations).any():

@@ -32,8 +32,7 @@ def drawn(seed, count=6000, noise=None):
         "translation_error_m": (dims, error[:, :3] * np.linalg.norm(tvec, axis=1)[:, None]),
         "reprojection_error_px": ("trial", ratio),
         "alternative_reprojection_error_px": ("trial", np.ones(count)),
-        "flipped": ("trial", np.where(
-            flipped, Flipped.flipped, Flipped.not_flipped).astype(np.uint8)),
+        "flipped": ("trial", np.where(flipped, Flipped.flipped, Flipped.not_flipped)),
         "estimate": ("trial", np.full(count, EstimateStatus.solved, np.uint8)),
     }, {"side_px": ("trial", 90.0 / z)})
 
@@ -54,8 +53,8 @@ def model():
 
 def test_errors_of_other_draws_are_as_large_as_the_covariance_says(model):
     found = judged(model, drawn(2))
-    known = found["known"].values
-    chance, flipped = (found[name].values[known] for name in ("flip_probability", "flipped"))
+    chance, flipped = (
+        found[name].values[found["known"]] for name in ("flip_probability", "flipped"))
     assert 5.8 < (found["whitened"].dropna("pose") ** 2).sum("row").mean() < 6.2
     for bin_ in np.array_split(np.argsort(chance), 5):
         expected, spread = chance[bin_].sum(), np.sqrt((chance * (1 - chance))[bin_].sum())
@@ -91,6 +90,8 @@ def test_outside_what_was_simulated_nothing_is_known_also_from_json(model):
     assert np.isnan(found.drop_vars("known").isel(pose=slice(1, None)).to_array()).all()
     pose, text = ([[3.0, 0.2, 0.0]], [[0.1, 0.0, 2.0]], 0.3), model.to_json()
     assert model.at(*pose).equals(DetectionModel.from_json(text).at(*pose))
-    for part, edited in ("flips", "flip"), ('"bias": [', '"bias": [0, '), (" 0.0,", "99,"):
-        with pytest.raises(DatasetError, match="make it again"):
+    for part, edited in (
+            ("flips", "flip"), ('"poses": [', '"poses": [0, '), (" 0.0,", "99,"), ('m": ', 'm": -'),
+            ("0.0\n  ]", "NaN\n  ]"), ("{", "[" * 100_000)):
+        with pytest.raises(DatasetError, match="make it again with `sweep"):
             DetectionModel.from_json(text.replace(part, edited, 1))

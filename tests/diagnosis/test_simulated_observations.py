@@ -37,7 +37,7 @@ def scene(rng):
         np.tile(np.maximum(0.002, 0.005 * straight), (4, 1)).T, off if known else off * np.nan,
         np.full(n, 4.0), rng.uniform(-1, 1, n) if rng.random() < 0.5 else np.full(n, np.nan),
         Calibration(width, height, f, f, (width - 1) / 2, (height - 1) / 2, (), (), ()), size,
-        "DICT_APRILTAG_36h11", str(rng.choice([*REFINEMENTS])), 0.01,
+        "DICT_APRILTAG_36h11", str(rng.choice([*REFINEMENTS][:-1])), 0.01,
         "z" if rng.random() < 0.3 else "range")
 
 
@@ -81,7 +81,7 @@ def spoil(rows, name, rng):
 
 def with_noise(rows, side, rng):
     """Return observations with the tape's errors, and the refinement's noise and bias."""
-    bias, spread, noise, lateral = rows.expected
+    bias, spread, noise, lateral = REFINEMENTS[rows.refinement]
     n, range_px = len(side), bias + rng.normal(0, spread) + rng.normal(0, noise, len(side))
     said = rows.said * (1 + range_px / side)[:, None]
     said[:, :2] += rng.normal(0, lateral, (n, 2)) * said[:, 2:] / rows.camera.fx_px
@@ -114,7 +114,7 @@ def observation(seed, pairs):
                 side = rows.side_px  # of the marker as it is, which the image shows
         if (rows.said[:, 2] > 0).all():
             break
-    clean = replace(rows, said=rows.said * (1 + rows.expected[0] / side)[:, None])
+    clean = replace(rows, said=rows.said * (1 + REFINEMENTS[rows.refinement][0] / side)[:, None])
     return frozenset(map(str, names)) - {"agree"}, with_noise(rows, side, rng), clean
 
 

@@ -869,11 +869,10 @@ def fit(
          f"{'kept' if each.kept else 'left out'}{': ' if each.reason else ''}{each.reason}")
         for each in found.terms]
     size = next(each.estimate for each in found.terms if each.parameter == "marker_scale")
-    value, low, high = (100.0 * (each - 1.0) for each in size)
-    line = (f"markers are {value:+.2f} % [{low:+.2f}, {high:+.2f}] larger than their file says: "
-            "measure the print")
+    line = (f"markers are {size.value:.4f} [{size.low:.4f}, {size.high:.4f}] times as large as "
+            "their file says: measure the print")
     # What no caliper shows is not said.
-    told = "marker_scale" in found.scene and math.isfinite(low) and abs(value) >= 0.05
+    told = "marker_scale" in found.scene and math.isfinite(size.low) and abs(size.value - 1) >= 5e-4
     said = [line] if told else []
     lines = [library.table.Table.of(
         f"{found.markers} markers in {found.photographs} photographs; 95 % intervals by photograph,"

@@ -77,7 +77,7 @@ REFINEMENTS: dict[str, tuple[float, float, float, float]] = {
 # Side of the square where neither camera nor size are known.
 UNKNOWN_SIDE_PX = 80.0
 
-# Most rows: this many take 6 s and 1.3 GB on one core of the build machine.
+# Most rows: this many take about 7 s of processor time and 1.3 GB.
 MAX_ROWS = 150
 
 

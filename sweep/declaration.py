@@ -21,7 +21,8 @@ class Declared:
 
     ``types`` are the value's without None; ``default`` is MISSING if it must be given.
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
-    parameters may be drawn from a distribution per trial. ``lengths`` are those that a list of
+    parameters may be drawn from a distribution per trial. Numbers that are ``choices`` are all that
+    there are; beside words, any number is allowed. ``lengths`` are those that a list of
     numbers may have, ``list_text`` says so in words. ``plugin`` is the kind of plug-in that may be
     named in place of a choice. ``abbreviated`` choices are known by their number and the letters
     before it, such as ``36h11`` and ``tag36h11`` of ``DICT_APRILTAG_36h11``. ``reads`` returns a
@@ -37,7 +38,7 @@ class Declared:
     low: float = -math.inf
     high: float = math.inf
     open_low: bool = False
-    choices: tuple[str, ...] = ()
+    choices: tuple[Any, ...] = ()
     prefix: str = ""
     drawable: bool = False
     lengths: tuple[int, ...] = ()
@@ -49,7 +50,7 @@ class Declared:
     def range_text(self) -> str:
         """Return the allowed values in words, as error messages and the reference print them."""
         if self.choices:
-            return "one of " + ", ".join(self.choices)
+            return "one of " + ", ".join(map(str, self.choices))
         # Whole bounds with all their digits: 2**63 - 1 is no round number.
         low, high = (f"{each:{'d' if isinstance(each, int) else 'g'}}"
                      for each in (self.low, self.high))
@@ -61,7 +62,8 @@ class Declared:
     def choice(self, word: str) -> str | None:
         """Return the choice that a word names, however OpenCV or the user spells it, or None.
 
-        Letters' cases do not count, nor do the module and the prefix of OpenCV's names.
+        Letters' cases do not count, nor do the module and the prefix of OpenCV's names. The empty
+        word is one where it is the default.
 
         Examples
         --------
@@ -70,7 +72,7 @@ class Declared:
         >>> solver.choice("cv2.SOLVEPNP_IPPE_SQUARE"), solver.choice("Ippe"), solver.choice("p3p")
         ('ippe_square', 'ippe', None)
         """
-        if word in self.choices:
+        if word in self.choices or word == self.default == "":
             return word
         prefix = letters_of(self.prefix)
         wanted = letters_of(word.replace("::", ".").rpartition(".")[2]).removeprefix(prefix)
@@ -81,9 +83,10 @@ class Declared:
         return spelled[found[0]] if len(found) == 1 else None
 
     def admits(self, number: float) -> bool:
-        """Return whether a finite number lies in the declared range."""
+        """Return whether a finite number lies in the declared range, and is a choice."""
+        numbers = [each for each in self.choices if not isinstance(each, str)] or [number]
         above = number > self.low if self.open_low else number >= self.low
-        return above and number <= self.high and abs(number) < 1e300
+        return above and number <= self.high and abs(number) < 1e300 and number in numbers
 
     def expected(self) -> str:
         """Return the allowed values in words."""
@@ -105,7 +108,7 @@ class Declared:
                 if bool in self.types:
                     return value
             case str() if str in self.types and (
-                    word := self.choice(value) if self.choices else value):
+                    word := self.choice(value) if self.choices or not value else value) is not None:
                 return word
             case list() | tuple() if len(value) in self.lengths and all(map(_is_number, value)):
                 return tuple(map(float, value))
@@ -114,7 +117,7 @@ class Declared:
             case int() | float() if float in self.types and self.admits(value):
                 return float(value)
         word = value.removeprefix(self.prefix) if isinstance(value, str) else ""
-        raise ValueError(f"{self.expected()}{nearest(word, self.choices)}")
+        raise ValueError(f"{self.expected()}{nearest(word, [*map(str, self.choices)])}")
 
 
 def _is_number(value: Any) -> bool:
@@ -148,11 +151,10 @@ def declared_fields(declaring: type) -> dict[str, Declared]:
         declaration = field.metadata["declaration"]
         unit = declaration.unit or next(
             (unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
-        default = field.default
         kinds = tuple(get_origin(each) or each  # tuple[float, ...] is a tuple
                       for each in get_args(hints[field.name] | None) if each is not type(None))
-        if kinds == (float,) and type(default) is int:
-            default = float(default)
+        default = (float(field.default) if kinds == (float,) and type(field.default) is int
+                   else field.default)
         declared[field.name] = dataclasses.replace(
             declaration, name=field.name, types=kinds, default=default, unit=unit)
     return declared

@@ -231,8 +231,7 @@ def stag_search(settings: StagSettings, library: str) -> Callable[[Any], Markers
         corners, ids, rejected = stag.detectMarkers(
             image, int(library), settings.error_correction)
         return Markers(
-            np.reshape(corners, (-1, 4, 2)), np.ravel(np.asarray(ids, dtype=np.int64)),
-            np.reshape(rejected, (-1, 4, 2)))
+            np.reshape(corners, (-1, 4, 2)), np.ravel(ids), np.reshape(rejected, (-1, 4, 2)))
 
     return search
 

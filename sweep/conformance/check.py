@@ -195,7 +195,7 @@ def judged_corners(
     elif order != (0, 1, 2, 3):
         own = declared.corner_order if declared else range(4)
         faults.append("corners are in another order: declare "
-                      f"corner_order = {tuple(own[index] for index in order)}")
+                      f"corner_order = {tuple(int(own[index]) for index in order)}")
     if faults:
         return Finding(FAULT, "; ".join(faults), numbers)
 
@@ -327,13 +327,12 @@ def check_plugin(
     if not 0 < time_limit_s < float("inf"):
         raise ArgumentError("time_limit_s", time_limit_s, "expected seconds above 0")
     if name == OPENCV or name in SOLVERS:
-        plugin = DeclaredPlugin("detector" if name == OPENCV else "estimator", name)
+        tried = [DeclaredPlugin("detector" if name == OPENCV else "estimator", name)]
     else:
         tried = [each for each in described(name, folder) if each.kind in CHECKS]
-        if not tried:
-            raise ArgumentError(
-                "name", name, "expected a detector or a solver; runs check the others")
-        plugin = tried[0]
+    if not tried:
+        raise ArgumentError("name", name, "expected a detector or a solver; runs check the others")
+    plugin = tried[0]
     if dictionary is None:
         known = sorted(plugin.dictionaries or (PREFERRED,), key=lambda each: each != PREFERRED)
         dictionary = next((each for each in known if missing_package(each) is None), known[0])

@@ -117,24 +117,25 @@ MAX_BYTES = 10**9
 def _table(text: str, source: str, faults: dict[int, str]) -> pd.DataFrame:
     """Return the cells of a CSV text as text, by our names of columns and by line.
 
-    ``faults`` gets the lines whose number of values is wrong. Empty lines and lines that begin with
-    ``#`` are left out. The header must have image and id, and all columns of the corners, of the
-    pose, or of both; further columns are left out.
+    ``faults`` gets the lines whose number of values is wrong, or of which one is longer than the
+    csv module takes. Empty lines and lines that begin with ``#`` are left out. The header must have
+    image and id, and all columns of the corners, of the pose, or of both; further columns are left
+    out.
 
     Raises
     ------
     PipelineError
         If the header is at fault.
     """
-    lines = {  # what is cut of a line is at fault in any case
-        number: line[:csv.field_size_limit()]
-        for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    }
-    separator = max(SEPARATORS, key=next(iter(lines.values()), "").count)
-    rows = {number: [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
-            for number, line in lines.items()}
-    first = next(iter(rows), 0)
+    lines = {number: line for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1)
+             if line.strip() and not line.lstrip().startswith("#")}
+    first, rows = next(iter(lines), 0), dict[int, list[str]]()
+    separator = max(SEPARATORS, key=lines.get(first, "").count)
+    for number, line in lines.items():
+        try:
+            rows[number] = [*map(str.strip, next(csv.reader([line], delimiter=separator)))]
+        except csv.Error as error:  # a value that is too long
+            faults[number] = f"{error}; expected shorter values; leave the column out"
     written = rows.pop(first, ["image", "id", *CORNER_COLUMNS])
     header = [ALIASES.get(name.lower(), name.lower()) for name in written]
     turns = QUATERNION if QUATERNION[0] in header else VECTOR
@@ -155,7 +156,7 @@ def _table(text: str, source: str, faults: dict[int, str]) -> pd.DataFrame:
     elif repeated := [name for name in expected if header.count(name) > 1]:
         fault = f"the column {repeated[0]} is there twice"
     else:
-        fault = ""
+        fault = faults.get(first, "")
     if fault:
         raise PipelineError([f"{source}: line {first}: {plain(fault, 300)}"])
     faults |= {number: f"{len(row)} values; expected {len(header)}, as the header has"

@@ -194,9 +194,9 @@ EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
     **dict.fromkeys(("make", "apply", "render"), (callable, "a class or function")),
     "distribution": (lambda names: isinstance(names, str | Sequence), "a name, or several"),
     "families": (lambda names: isinstance(names, Mapping | None), "names by dictionary, or None"),
-    "pixel_center": (lambda at: isinstance(at, float | int) and -1 <= at <= 1, "0 or 0.5"),
-    "corner_order": (lambda order: isinstance(order, Sequence) and sorted(map(repr, order)) == [
-        "0", "1", "2", "3"], "the numbers 0 to 3, each once"),
+    "pixel_center": (lambda at: hasattr(at, "__float__") and -1 <= at <= 1, "0 or 0.5"),
+    "corner_order": (lambda order: hasattr(order, "__getitem__") and sorted(map(str, order)) == [
+        *"0123"] and {*order} == {0, 1, 2, 3}, "the numbers 0 to 3, each once"),
     "step": (lambda step: step in ("light", "signal"), "light or signal"),
     "widens": (lambda widens: widens in get_args(Widens), "nothing, noise or uneven light"),
 }

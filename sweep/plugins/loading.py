@@ -14,7 +14,6 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar, Literal, Self, cast, get_type_hints
@@ -282,21 +281,6 @@ def is_recording(name: str) -> bool:
     return name.endswith(SUFFIX)
 
 
-def recorded_detector(path: Path) -> tuple[RecordedDetector, str]:
-    """Return the detector of a file of recorded detections, and the file's SHA-256.
-
-    Raises
-    ------
-    PluginError
-        If it cannot be read, or is none; in words that follow "expected".
-    """
-    recording, digest = Recording.read(path)
-    return RecordedDetector(
-        make=lambda settings, family: lambda image: Markers((), ()),  # noqa: ARG005
-        margin_px=0, meaning="detections that another program made", recording=recording,
-    ), digest
-
-
 # --------------------------------------------------------------------------------------------------
 # Plug-ins by name: entry points, whose names are read without importing, and files.
 #
@@ -307,12 +291,12 @@ def recorded_detector(path: Path) -> tuple[RecordedDetector, str]:
 Versions = tuple[tuple[str, str], ...]
 
 
-def offered(kind: str) -> EntryPoints:
+def offered(kind: str) -> importlib.metadata.EntryPoints:
     """Return the entry points of the installed plug-ins of a kind; none is imported."""
     return importlib.metadata.entry_points(group=f"sweep.{kind}s")
 
 
-def _entry_point(kind: str, name: str) -> EntryPoint:
+def _entry_point(kind: str, name: str) -> importlib.metadata.EntryPoint:
     """Return an installed plug-in's entry point; PluginError if not exactly one has the name."""
     entries, names = offered(kind), sorted(offered(kind).names)
     found = tuple(entries.select(name=name))
@@ -360,7 +344,10 @@ def load(kind: str, name: str, folder: str) -> tuple[Plugin, str, Versions]:
     record: Any = RECORDS[kind]
     path, digest, versions = Path(folder) / file_of(name), "", {}
     if is_recording(name):
-        found, digest = recorded_detector(path)
+        recording, digest = Recording.read(path)
+        found = RecordedDetector(
+            make=lambda settings, family: lambda image: Markers((), ()),  # noqa: ARG005
+            margin_px=0, meaning="detections that another program made", recording=recording)
     elif file_of(name):
         with reading(f"the file {plain(file_of(name))}", path):
             source = path.read_bytes()
@@ -418,6 +405,9 @@ def _module(path: str, digest: str, source: bytes) -> ModuleType:
 
 #: Types that a setting may have.
 TYPES: dict[str, type] = {"float": float, "int": int, "bool": bool, "str": str}
+
+#: Declarations that are taken over from a plug-in's record.
+TRAITS = ("needs_images", "of_boards", "random", "widens", "step")
 
 #: Key of the plug-ins in a store's metadata.
 RECORDED = "plugins"
@@ -520,30 +510,39 @@ def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
         In one line, what was expected instead.
     """
     record, digest, versions = load(kind, name, folder)
-    shared = {key: value for key, value in vars(record).items() if key in DeclaredPlugin.__slots__}
-    return DeclaredPlugin(**shared | {
-        "kind": kind, "name": name, "versions": versions, "file": file_of(name), "digest": digest,
-        "settings": _settings(kind, record),
-        "dictionaries": tuple(map(str, getattr(record, "families", None) or ()))})
+    return DeclaredPlugin(
+        kind, name, record.meaning, versions, file_of(name), digest, _settings(kind, record),
+        tuple(map(str, getattr(record, "families", None) or ())),
+        **{trait: value for trait, value in vars(record).items() if trait in TRAITS})
 
 
 def _settings(kind: str, record: Plugin) -> tuple[Declared, ...]:
-    """Return the settings that a plug-in's dataclass declares."""
+    """Return the settings that a plug-in's dataclass declares.
+
+    Of NumPy's numbers and of members of enumerations, plain numbers and texts are declared: a store
+    records them, and other processes do not know the plug-in's types.
+    """
     types = [name for name in TYPES if name != "str" or kind not in ("effect", "renderer")]
-    expected = (
-        f"settings of the {kind} as a dataclass with `name: type = parameter(default, meaning)`, "
-        f"of the types {', '.join(types)}; not so:")
+    expected = f"settings of the {kind} as a dataclass of parameters, not so:"
     with _its_faults(expected):
         fields = dataclasses.fields(record.settings) if record.settings else ()
-        wrong = [each.name for each in fields if "declaration" not in each.metadata]
-        declared = declared_fields(record.settings) if record.settings and not wrong else {}
-        wrong += [name for name, each in declared.items() if each.reads
-                  or not {one.__name__ for one in each.types} <= {*types}
-                  or {*map(type, (each.meaning, each.unit, *each.choices))} != {str}]
+        faults = [f"{each.name}: expected `{each.name}: type = parameter(default, meaning)`"
+                  for each in fields if getattr(each.metadata.get("declaration"), "reads", True)]
+        declared = declared_fields(record.settings) if record.settings and not faults else {}
+        for name, each in declared.items():
+            default, *choices = ("".join(one) if isinstance(one, str) else np.array(one).tolist()
+                                 for one in (each.default, *each.choices))
+            declared[name] = dataclasses.replace(each, default=default, choices=tuple(choices))
+            faults += [f"{name}: expected {words}" for fits, words in (
+                ({*each.types} <= {*map(TYPES.get, types)}, f"a type of {', '.join(types)}"),
+                ({type(each.meaning), type(each.unit)} == {str}, "meaning and unit as texts"),
+                ({isinstance(one, str) for one in choices} <= {str in each.types},
+                 f"choices that are {'texts' if str in each.types else 'numbers'}, as its values"),
+            ) if not fits]
         given = {name: each.default for name, each in declared.items() if each.default is not None}
-        wrong = wrong or check_table(declared, given, "")[1]
-    if wrong:
-        raise PluginError(f"{expected} {', '.join(wrong)}")
+        faults = faults or check_table(declared, given, "")[1]
+    if faults:
+        raise PluginError(f"{expected} {'; '.join(faults)}")
     if kind == "effect" and not declared:
         raise PluginError("settings, of which the first switches the effect on")
     return tuple(declared.values())

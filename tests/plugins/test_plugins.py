@@ -42,6 +42,8 @@ from sweep.plugins import DetectorPlugin, parameter
 @dataclass(frozen=True)
 class Settings:
     shift_px: float = parameter(0.0, "shift of the corners", unit="px", low=-9, high=9)
+    file: str = parameter("", "a file, or none")
+    rounds: int = parameter(np.int64(1), "times of search", choices=(1, 2))
 
 class Turned:  # OpenCV's own search, with other conventions
     def __init__(self, settings, family):
@@ -53,13 +55,11 @@ class Turned:  # OpenCV's own search, with other conventions
         corners, ids, _ = self.search(image)
         if ids is None:
             return [], []
-        turned = np.concatenate(corners)[:, [2, 3, 0, 1]]
-        return turned + 0.5 + self.shift, ids.ravel()
+        return np.concatenate(corners)[:, [2, 3, 0, 1]] + 0.5 + self.shift, ids.ravel()
 
 TURNED = DetectorPlugin(
-    make=Turned, settings=Settings, pixel_center=0.5, corner_order=(2, 3, 0, 1), margin_px=16,
-    distribution="",
-)
+    make=Turned, settings=Settings, pixel_center=0.5, corner_order=np.array([2, 3, 0, 1]),
+    margin_px=16, distribution="")
 """
 
 GRID = """
@@ -343,6 +343,7 @@ def test_what_a_function_margin_px_raises_is_the_plug_in_s_fault(bad):
      "ValueError: make = 1: expected a class or function (line 2 of mine.py)"),
     (MINE.replace("high=9", "high=-1").replace("TURNED", "D"),
      "not so: shift_px = 0.0: expected a number from -9 to -1"),
+    (MINE.replace("(1, 2)", "'ab'").replace("TURNED", "D"), "rounds: expected choices that are n"),
     ("from sweep.plugins import *\nD = DetectorPlugin(make=print, distribution='not-there-9')",
      "the distribution not-there-9, which is not installed: `pip install not-there-9`"),
     ("from sweep.plugins import *\nD = DetectorPlugin(make=print, corner_order=(0., 1., 2., 3.))",

@@ -352,9 +352,8 @@ def compare(
     one, other = path_of("first", first), path_of("second", second)
     library.lifecycle.open_finished(one)
     if other.endswith(".toml"):
-        place = os.fspath(store or library.prepare.twin_store(one, other))
-        twins(one, other, repeats=repeats, store=place, **options)
-        other = place
-    elif unused := [name for name in given if given[name] != usual[name]]:
-        raise ArgumentError(unused[0], given[unused[0]], "expected photographs and a TOML file")
+        scene, other = other, os.fspath(store or library.prepare.twin_store(one, other))
+        twins(one, scene, repeats=repeats, store=other, **options)
+    elif unused := [name for name in given if given[name] not in (usual[name], [])]:
+        raise ArgumentError(unused[0], given[unused[0]], "expected none: two stores need no run")
     return library.findings.compare(one, other, bins=bins or None, output=output)

@@ -71,13 +71,15 @@ class ArgumentError(SweepError, ValueError):
 MAX_WORKERS = 1000
 
 
-def check_positive(argument: str, value: Any, expected: str = "", most: int = 0) -> None:
-    """Raise ArgumentError unless a value is a number above 0, or None; whole if ``most`` is given.
+def check_positive(argument: str, value: Any, expected: str = "", most: int = MAX_WORKERS) -> None:
+    """Raise ArgumentError unless a value is None, or a number above 0 as it is ``expected``.
 
-    Numbers of 1e300 and more are not finite here, as nowhere.
+    Where no text says what is expected, it is a whole number up to ``most``. Numbers of 1e300 and
+    more count as infinite, as everywhere here.
     """
-    kind: Any = numbers.Integral if most else numbers.Real
-    if value is not None and not (isinstance(value, kind) and 0 < value <= (most or 1e300)):
+    kind: Any = numbers.Real if expected else numbers.Integral
+    if value is not None and not (isinstance(value, kind) and 0 < value < float("inf")
+                                  and int(value) <= (10**300 if expected else most)):
         raise ArgumentError(argument, value, expected or f"expected a whole number, 1 to {most:,}")
 
 

@@ -1048,7 +1048,7 @@ def plugins(
     name : NAME
         A plug-in to describe: the name of an installed one, or file:name in this folder; or the
         word check, and the plug-in to try behind it.
-    tried : TRIED
+    tried : NAME
         Behind check: a detector or a solver, also opencv or one of our solvers.
     settings : --set KEY=VALUE
         Check: give a setting of it this TOML value; may be repeated.
@@ -1065,7 +1065,7 @@ def plugins(
             "tried", tried, f"expected one name; `sweep plugins check {tried}` tries it")
     if settings or dictionary or name == "check":
         raise ArgumentError("settings" if settings else "dictionary" if dictionary else "tried", "",
-                            "expected a name behind `check`")
+                            "expected `sweep plugins check NAME`")
     if name is None:
         every = library.loading.installed()
         lines = [f"{each['kind']:10} {each['name']:20} of {each['distribution']}"

@@ -189,7 +189,7 @@ def error_model(
         A store of `photos` with the same setting and solver, or its results: six factors along and
         about the line of sight, the tilt and across widen the covariance, and the errors are
         correlated as far as photographs agree on it, so that it describes them. One photograph
-        shows no correlation; NaN errors are not counted. Judge it on others.
+        shows no correlation; errors that are NaN are left out. Judge it on others.
 
     Returns
     -------

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.errors import ArgumentError, PipelineError, RunError, StoreError, SweepError
+from sweep import errors
 from sweep.evaluation import results
 from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
 from sweep.evaluation.results import CellsResult, Failure, compare, is_same, to_dataset_layout
@@ -161,19 +161,18 @@ def check_blocks(
     return sound
 
 
-def check_needed(store: RunStore, sound: Container[int], report: IntegrityReport) -> None:
+def check_needed(store: RunStore, sound: Mapping[int, Receipt], report: IntegrityReport) -> None:
     """Find blocks of a finished store that follow from other results of earlier waves than it has.
 
     Which of their scenes were needed is not what the rule says.
     """
-    numbers = range(len(store.blocks))
-    if store.pipeline.stopping is None or not all(number in sound for number in numbers):
+    if store.pipeline.stopping is None or len(sound) < len(store.blocks):
         return
     current = InWaves(store).current
     report.damage += [
         Damage(f"block {store.blocks[number]}", "was computed for other results of earlier trials",
                number)
-        for number in numbers if number not in current
+        for number in sound if number not in current
     ]
 
 
@@ -221,7 +220,7 @@ def check_scenes(
         return
     try:
         pipeline, changes = current_pipeline(store)
-    except SweepError as error:
+    except errors.SweepError as error:
         changes = str(error).splitlines()
     scenes = [] if changes else _drawn(store, sample, sound)
     if not scenes:
@@ -354,7 +353,7 @@ def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:
         If there is no store, or so little of one that its pipeline is lost.
     """
     if sample < 0:
-        raise ArgumentError("sample", sample, "expected at least 0")
+        raise errors.ArgumentError("sample", sample, "expected at least 0")
     store = lifecycle.open_unchecked(url)
     done = blocks.committed(store)
     report = IntegrityReport(store.url, store.finished, len(store.blocks), len(done))
@@ -374,10 +373,7 @@ def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:
 # --------------------------------------------------------------------------------------------------
 # Repair: damaged blocks are dropped, all other files written again, and a run does the rest.
 
-def repair(
-    url: str, sample: int = SAMPLE, *, workers: int | None = None,
-    time_limit_s: float | None = None,
-) -> IntegrityReport:
+def repair(url: str, sample: int = SAMPLE, *, workers: int | None = None) -> IntegrityReport:
     """Verify a store and repair it: exactly the damaged blocks are dropped, and run again.
 
     Those of an unfinished store are left to the run that continues it.
@@ -390,8 +386,6 @@ def repair(
         Scenes that are recomputed and compared before the repair.
     workers
         Processes that recompute blocks; by default, one a processor.
-    time_limit_s
-        Block timeout in seconds.
 
     Returns
     -------
@@ -400,11 +394,14 @@ def repair(
 
     Raises
     ------
+    ArgumentError
+        If an argument is out of its range; nothing is dropped.
     StoreError
         If there is no store, it cannot be written, or its blocks would be different here.
     RunError
         If blocks failed.
     """
+    errors.check_positive("workers", workers, most=errors.MAX_WORKERS)
     before = verify(url, sample)
     if not before.damage:
         return before
@@ -412,11 +409,11 @@ def repair(
     store = lifecycle.open_unchecked(url, "r+")
     pipeline, changes = current_pipeline(store) if numbers else (store.pipeline, [])
     if changes:
-        raise StoreError(
+        raise errors.StoreError(
             "\n".join([f"{store.url}: cannot be recomputed on this machine:", *changes]))
     store = lifecycle.reopen(store, drop=numbers)
     if before.finished and numbers:
-        execute(pipeline, url, workers=workers, time_limit_s=time_limit_s, yes=True)
+        execute(pipeline, url, workers=workers, yes=True)
     elif before.finished:
         close(store)
     after = replace(verify(url, 0), sampled=before.sampled, not_sampled=before.not_sampled,
@@ -558,7 +555,7 @@ def _index(pipeline: Pipeline, at: str) -> dict[str, int]:
             faults.append(f"--at {name}={plain(value)}: not on the grid; its values are "
                           f"{excerpt(axis.values)}")
     if faults:
-        raise PipelineError(faults)
+        raise errors.PipelineError(faults)
     return index
 
 
@@ -567,7 +564,7 @@ def _inspected(
 ) -> tuple[SceneInspection | None, NDArray[np.uint8] | None]:
     """Return the inspected scene and its image; None for one that raises or ends its process."""
     for function in (inspect_scene, scene_image):
-        with contextlib.suppress(ChildError, RunError), Child() as child:
+        with contextlib.suppress(ChildError, errors.RunError), Child() as child:
             found: Any = child.call(
                 partial(function, cell_pipeline, whole_frame=whole_frame), limit_s=limit_s)
             return (found, found.image) if function is inspect_scene else (None, found)

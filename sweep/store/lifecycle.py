@@ -259,8 +259,8 @@ def open_unchecked(url: str, mode: Literal["r", "r+"] = "r") -> RunStore:
         )
         cut = Blocks(
             tuple(len(axis) for axis in pipeline.experiment.scene_axes), tuple(metadata["block"]))
-        group = zarr.open_group(
-            blocks.CheckedReads(storage, url), mode=mode, zarr_format=3, use_consolidated=False)
+        checked = blocks.CheckedReads(storage, url, finished=metadata["finished"])
+        group = zarr.open_group(checked, mode=mode, zarr_format=3, use_consolidated=False)
         return RunStore(url, storage, group, pipeline, metadata["run_id"], cut)
     except UNREADABLE:
         raise StoreError(locations.not_a_store(url)) from None

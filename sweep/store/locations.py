@@ -43,7 +43,7 @@ def not_a_store(url: str) -> str:
             f"{url}: not a sweep store, but a pipeline file; `sweep run {plain(url)}` makes its "
             f"store, by default runs/{plain(Path(url).stem)}.zarr"
         )
-    return f"{url}: not a sweep store; choose another path"
+    return f"{url}: not a sweep store, which `sweep run FILE.toml` makes; choose another path"
 
 
 @contextlib.contextmanager

@@ -41,7 +41,7 @@ NOT_FOUND = "store not found; create one with `sweep run`"
 
 PLACES = {
     "small.toml/s.zarr": NOT_FOUND,
-    "/dev/null": "not a sweep store; choose another path",
+    "/dev/null": "not a sweep store, which `sweep run FILE.toml` makes; choose another path",
     "loop.zarr": "cannot be read: Too many levels of symbolic links",
     "file:/a/b.zarr": "a store on this machine is named by its path: /a/b.zarr",
     "memory://x.zarr": "no other process sees this one's memory; choose a path or s3://",

@@ -40,8 +40,7 @@ pose = { jitter_px = 0.5, tilt_deg = { uniform = [0, 60] } }
 axes = { side_px = [30, 60], solver = ["ippe_square", "iterative"], trial = 4 }
 """
 
-EXTENTS = (1, 2)
-"""Four blocks of the grid."""
+EXTENTS = (1, 2)  # four blocks of the grid
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +130,7 @@ def test_opened_store_shows_the_blocks_committed_until_then(pipeline, tmp_path, 
     assert np.isnan(after.rotation_error_deg[2:]).all()
     assert np.isfinite(after.rotation_error_deg[:2]).all()
     close(open_store(url, "r+"))
-    with sweep.open(url) as results:
-        assert (results.estimate == 1).all()
+    assert (sweep.open(url).estimate == 1).all()
     monkeypatch.setattr("sweep.store.files.list_folder", lambda *_: [])
     assert check_whole(open_store(url)) == {0, 1}  # no folder has changed since: none is listed
     with pytest.raises(StoreError, match="2 of 2 blocks lack"):  # those of a copy are
@@ -188,9 +186,12 @@ def test_readers_name_what_is_gone_and_what_repairs_it(lost, grid, copied):
 @pytest.mark.parametrize("share", [None, 0, 0.5], ids=["deleted", "emptied", "cut"])
 def test_each_reader_names_a_damaged_store_and_what_repairs_it(share, copied, monkeypatch, capsys):
     monkeypatch.chdir(Path(shutil.copytree(copied, copied.with_name("good.zarr"))).parent)
+    opened = sweep.open(copied)
     for name in ("detection", "estimate", "rotation_error_deg", "translation_error_m"):
         content = (chunk := next(copied.glob(f"{name}/c.*"))).read_bytes()
         chunk.unlink() if share is None else chunk.write_bytes(content[:int(share * len(content))])
+    with pytest.raises(DamagedStoreError, match=r"whole\.zarr: damaged: .*/c\.\S+: (mis|chang)"):
+        opened.load()
     Path("big.toml").write_text(GRID.replace("30, 60", "30, 60, 90"))
     for words in (
         "report {}", "report {} --error-model e.json", "require {} detection>=0.1", "tradeoff {}",

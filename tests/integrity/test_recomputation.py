@@ -37,8 +37,7 @@ solver = ["ippe_square", "iterative"]
 trial = 3
 """
 
-EXTENTS = (1, 1, 3)
-"""Block k has the scenes 3 k to 3 k + 2."""
+EXTENTS = (1, 1, 3)  # block k has the scenes 3 k to 3 k + 2
 
 NEAR = "distance_m=0.2,distortion=[],cornerRefinementMethod=subpix,solver=iterative,trial=1"
 """The scene 1, in which the marker is found."""

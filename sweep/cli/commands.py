@@ -17,7 +17,7 @@ import sweep
 from sweep import library
 from sweep.cli import command as cli
 from sweep.cli.command import Names, Numbers
-from sweep.errors import MAX_WORKERS, ArgumentError, check_positive
+from sweep.errors import ArgumentError, check_positive
 from sweep.isolation.child_process import Child, default_workers
 from sweep.messages import plain, quoted
 
@@ -187,7 +187,7 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
     ArgumentError
         If there are no workers.
     """
-    check_positive("workers", workers, most=MAX_WORKERS)
+    check_positive("workers", workers)
     costs = library.forecast
     with Child() as child:
         timing = costs.measure(child, pipeline)

@@ -20,6 +20,7 @@ SHOWN, LEAST_SHARE = 6, 0.001
 
 UNEXPLAINED = "No known cause explains these rows"
 
+
 def diagnose(
     observations: str | os.PathLike[str] | Mapping[str, Sequence[Any]], *,
     camera: str | os.PathLike[str] | Calibration | None = None, size_m: float | None = None,

@@ -23,7 +23,7 @@ from jinja2 import Template
 from numpy.typing import NDArray
 from rich import filesize
 
-from sweep.errors import MAX_WORKERS, RunError, StoreError, check_positive
+from sweep.errors import RunError, StoreError, check_positive
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SceneBatch, common_windows, scenes_at, searched_windows
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
@@ -403,7 +403,7 @@ def export(
     RunError
         If an image cannot be rendered, or a process that renders is ended.
     """
-    check_positive("workers", workers, most=MAX_WORKERS)
+    check_positive("workers", workers)
     target = Path(folder)
     count = len(pipeline.experiment.all_scenes)
     parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]

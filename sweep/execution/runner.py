@@ -99,7 +99,7 @@ def execute(
     workers, time_limit_s = options["workers"], options["time_limit_s"]
     scheduler, client = options["scheduler"], options["client"]
     reuse, overwrite = options["reuse"], options["overwrite"]
-    errors.check_positive("workers", workers, most=errors.MAX_WORKERS)
+    errors.check_positive("workers", workers)
     if scheduler is not None and client is not None:
         raise errors.ArgumentError("scheduler", scheduler, "expected no client beside it")
     errors.check_positive("time_limit_s", time_limit_s, "expected seconds above 0")

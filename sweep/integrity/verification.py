@@ -401,7 +401,7 @@ def repair(url: str, sample: int = SAMPLE, *, workers: int | None = None) -> Int
     RunError
         If blocks failed.
     """
-    errors.check_positive("workers", workers, most=errors.MAX_WORKERS)
+    errors.check_positive("workers", workers)
     before = verify(url, sample)
     if not before.damage:
         return before

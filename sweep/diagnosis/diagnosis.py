@@ -126,12 +126,15 @@ def size_of(each: inference.Explanation, rows: Observations) -> str:
             f"(± {100.0 * spread * sd:.2g} %)" if spread else
             f"{f'{axis} ' * (len(columns) > 1)}{scale * mean:+.2f} ± {scale * sd:.2g} {unit}"
             * bool(unit) for axis, _, (mean, sd) in zip("xyz", columns, numbers, strict=False)]
-        if way["label"][0]:  # of a dozen units that fit, the three likeliest are named
-            sizes.append(" or ".join(dict.fromkeys(filter(None, way["label"][:3]))))
-        if sizes := [*filter(None, sizes)]:
+        if sizes := [*filter(None, [*sizes, label_of(way)])]:
             named = len(each.causes) > 1 and cause.name != inference.ROWS
             texts.append(f"{cause.name}: " * named + ", ".join(sizes))
     return "; ".join(texts)
+
+
+def label_of(ways: inference.Ways) -> str:
+    """Return the names of the three likeliest ways; empty if the likeliest has none."""
+    return " or ".join([*filter(None, dict.fromkeys(ways["label"]))][: 3 * bool(ways["label"][0])])
 
 
 def _sentence(
@@ -140,14 +143,15 @@ def _sentence(
 ) -> str:
     """Return the answer in one sentence, with what to do."""
     test, size = first.words("test", "; "), size_of(first, rows)
-    names = [each.words("name").replace(inference.ROWS, "no listed cause")
-             for each in (first, *open_)]
+    # Which row stands apart: its cause is the last of an explanation.
+    names = [each.words("name").replace(
+        inference.ROWS, f"no listed cause ({label_of(each.way[-1])})") for each in (first, *open_)]
     count = len(rows.cells[0]) + 3 * np.isfinite(rows.yaw_off[:, 0]).sum()
     # Even the likeliest does not explain rows that misfit by 4 standard deviations. A yaw that may
     # be mirrored is expected to cost 1 + 2 ln 2.
     if (inference.ROWS in first.names and not open_) or (
             float(first.misfit[0]) - count > 4.0 * np.sqrt(2.0 * count)):
-        nearest = [f"nearest: {names[0]}"] * (first.names != {inference.ROWS})
+        nearest = [f"nearest: {names[0]}"] * (inference.ROWS not in first.names)
         return (f"{UNEXPLAINED} ({', '.join(filter(None, [*nearest, size]))}): measure again, look "
                 "for a wrong sign of yaw_deg, or state larger standard deviations.")
     if not first.names and (rows.side_px < inference.SIDE_LIMITS_PX[0]).any():

@@ -558,17 +558,15 @@ def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> dict
         speed=np.full(len(said), np.nanmean([*rows.speed, 0.0])))
     row, which = new.cells
     # A new row counts as apart, too, where an old one of its number does: those beside it decide.
-    means, variances = [], []
-    for each in (a, b):
-        # The unknown zero points are those of the new row alone where it measures a new component.
-        own = len(each.numbers) - len(np.unique(rows.cells[1]))
-        mean, columns, variance = (part[0] for part in predict(new, each.causes, each.way))
-        columns = columns[:, :own]
-        means.append(mean + columns @ each.numbers[:own])
-        variances.append(
-            np.einsum("dk,kl,dl->d", columns, each.covariance[:own, :own], columns)
-            + variance / 2.0 + 0.5 * rows.zero_sd_m**2)
-    difference = np.abs(means[0] - means[1]) / np.sqrt(variances[0] + variances[1])
+    # The unknown zero points are those of the new row alone where it measures a new component.
+    gap, variance = np.zeros(len(row)), np.full(len(row), rows.zero_sd_m**2)
+    for sign, each in ((1.0, a), (-1.0, b)):
+        own = slice(len(each.numbers) - len(np.unique(rows.cells[1])))
+        mean, columns, noise = (part[0] for part in predict(new, each.causes, each.way))
+        gap += sign * (mean + columns[:, own] @ each.numbers[own])
+        variance += 0.5 * noise + np.einsum(
+            "dk,kl,dl->d", columns[:, own], each.covariance[own, own], columns[:, own])
+    difference = np.abs(gap) / np.sqrt(variance)
     # Of rows that decide well enough the one that is nearest to those measured.
     enough = difference >= min(float(difference.max()), 2.0 * DECIDES)
     effort = np.abs(np.log(distance[row] / np.median(reach)))

@@ -25,7 +25,7 @@ from sweep.messages import nearest, plain
 from sweep.model.calibration import MAX_BYTES, Calibration
 from sweep.model.image_file import decode_grey
 from sweep.model.pose import mirrored, rotation_of_vector, vector_of_rotation
-from sweep.photographs.cameras import camera_of_file, cameras_of
+from sweep.photographs.cameras import camera_of_file, cameras_of, check_size
 from sweep.photographs.folder import detect_markers
 from sweep.typing import Floats, Integers
 
@@ -163,10 +163,9 @@ class Observations:
     notes: tuple[str, ...] = ()
 
     @property
-    def cells(self) -> tuple[Integers, Integers]:
+    def cells(self) -> tuple[Integers, ...]:
         """Row and component (0 to 3: x, y, z, straight) of each measured number (d,)."""
-        row, component = np.nonzero(np.isfinite(self.measured))
-        return row, component
+        return np.nonzero(np.isfinite(self.measured))
 
     @property
     def known_square(self) -> bool:
@@ -203,7 +202,7 @@ def read_observations(
         path_of("camera", camera))
     if IMAGE in cells:
         images = [folder / name for name in cells[IMAGE]]
-        table[CORNERS] = _detected(table, images, settings["dictionary"], settings["refinement"])
+        table[CORNERS] = _detected(table, images, believed, settings)
     there = table.notna()
     for name, others in NEEDED.items():
         _each_row(~there[name] | there[others].any(axis=1),
@@ -305,18 +304,22 @@ def _numbers(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def _detected(
-    table: pd.DataFrame, images: Sequence[Path], dictionary: str, refinement: str
+    table: pd.DataFrame, images: Sequence[Path], camera: Calibration | None, given: dict[str, Any]
 ) -> Floats:
-    """Return the corners (n, 8) of a marker in each image (n,)."""
+    """Return the corners (n, 8) of a marker in each image (n,), which has the camera's size."""
+    dictionary = given["dictionary"]
     if not dictionary:
         raise _fault(f"{IMAGE} needs --set dictionary=...")
     if table[CORNERS].notna().any(axis=None):
         raise _fault(f"{IMAGE} or corners: give one of them")
-    find = make_detector(DetectorSetting(cornerRefinementMethod=refinement or "none"))
+    find = make_detector(DetectorSetting(cornerRefinementMethod=given["refinement"] or "none"))
     corners = []
     for row, (image, wanted) in enumerate(zip(images, table["marker_id"], strict=True)):
         try:
-            ids, quads, _ = detect_markers(find, decode_grey(str(image)), dictionary)
+            grey = decode_grey(str(image))
+            if camera is not None:
+                check_size("camera", "", camera, (grey.shape[1], grey.shape[0]))
+            ids, quads, _ = detect_markers(find, grey, dictionary)
         except (OSError, ValueError) as error:
             raise ArgumentError("observations", plain(image), str(error)) from None
         chosen = quads if np.isnan(wanted) else quads[ids == wanted]
@@ -331,10 +334,9 @@ def _detected(
 def _solved(corners: Floats, camera: Calibration, size_m: float) -> tuple[Floats, Floats]:
     """Return positions and rotation vectors (n, 3) of corners (n, 8), by guarded IPPE."""
     quads = corners.reshape(-1, 4, 2)
-    frame = np.array([camera.width_px or 0, camera.height_px or 0], dtype=np.float64)
-    if frame.all() and ((quads < -0.5) | (quads > frame)).any():
-        raise _fault("corners lie beyond the camera file's image of "
-                     f"{frame[0]:g} x {frame[1]:g} px: expected the calibration of their images")
+    frame = np.array([camera.width_px or np.inf, camera.height_px or np.inf])
+    _each_row(((quads >= -0.5) & (quads <= frame)).all(axis=(1, 2)),
+              f"corners beyond the camera's {frame[0]:g} x {frame[1]:g} px: give their calibration")
     cameras = cameras_of(camera, len(quads))
     rotation, position = both_planar_solutions(quads, cameras, np.full(len(quads), size_m))
     _each_row(np.isfinite(position[:, 0]).all(axis=-1), "the corners have no pose; expected top "

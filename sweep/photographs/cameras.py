@@ -229,7 +229,7 @@ def camera_of_file(written: str, size: tuple[int, int] | None = None) -> Calibra
     with _reading("camera", written, "a camera file"):
         calibration = calibration_of(read_tree(read_regular(path, MAX_BYTES)), name)
     if size is not None:
-        _check_size("camera", written, calibration, size)
+        check_size("camera", written, calibration, size)
     return calibration
 
 
@@ -250,7 +250,7 @@ def stereo_of_file(written: str, size: tuple[int, int]) -> StereoCamera:
         if np.abs(rotation - nearest).max() > ORTHOGONAL or np.linalg.det(nearest) < 0:
             raise ValueError("R: expected a rotation matrix")
     for each in (left, right):
-        _check_size("stereo", written, each, size)
+        check_size("stereo", written, each, size)
     return StereoCamera(left, right, nearest, translation)
 
 
@@ -287,7 +287,7 @@ def _numbers(tree: Any, name: str, shape: tuple[int, ...]) -> Floats:
     )
 
 
-def _check_size(
+def check_size(
     argument: str, written: str, calibration: Calibration, size: tuple[int, int]
 ) -> None:
     """Refuse the calibration of images of another size."""

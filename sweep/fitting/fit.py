@@ -123,19 +123,21 @@ class Field(NamedTuple):
     variance: Estimate = Estimate()
 
 
-def field_of(sums: Floats, shares: Floats, lengths_px: Floats) -> Field:
-    """Return the field that photographs' two sums of squares show.
+def field_of(known: Sequence[tuple[Floats, Floats]], lengths_px: Floats) -> Field:
+    """Return the field that photographs' two sums of squares show; nothing without photographs.
 
     Parameters
     ----------
-    sums
-        (n, 2) of n photographs, px².
-    shares
-        (n, 2, L) those expected of fields of standard deviation 1 px and of L correlation lengths;
-        the second over the first one rises with the length.
+    known
+        Of each photograph the sums (2,), px², and those (2, L) expected of fields of standard
+        deviation 1 px and of L correlation lengths; the second over the first one rises with the
+        length.
     lengths_px
         (L,) these lengths.
     """
+    if not known:
+        return Field()
+    sums, shares = map(np.array, zip(*known, strict=True))
     at, found, expected = np.log(lengths_px), sums.sum(axis=0), shares.sum(axis=0)
     rising = np.maximum.accumulate(expected[1] / expected[0])
     length = float(np.interp(found[1] / max(found[0], 1e-12), rising, at))
@@ -205,11 +207,7 @@ FAR = 1000
 def edge_field(fits: Sequence[PhotographFit]) -> Field:
     """Return the field of shifts of edges in photographs."""
     known = [edge_sums(fit) for fit in fits if np.isfinite(fit.noise).any()]
-    known = [each for each in known if each[1].any()]
-    if not known:
-        return Field()
-    sums, shares = map(np.array, zip(*known, strict=True))
-    return field_of(sums, shares, EDGE_LENGTHS * module_px(fits))
+    return field_of([each for each in known if each[1].any()], EDGE_LENGTHS * module_px(fits))
 
 
 def module_px(fits: Sequence[PhotographFit]) -> float:
@@ -316,41 +314,62 @@ def geometry_field(fits: Sequence[PhotographFit], edges: Field) -> Field:
         SHORTEST_MODULES * module_px(fits), LONGEST_SHARE * fits[0].states[0].marker.shown.width_px,
         60)
     known = [
-        _geometry_sums(fit, edges, *beside, lengths) for fit in fits
+        _geometry_sums(fit, edges, shifts, np.hstack([pose, free[:, :1]]), lengths) for fit in fits
         if len(fit.states) >= MIN_SHIFTED_MARKERS and np.isfinite(fit.noise).any()
-        and (beside := _beside_truth(fit.states)) is not None
+        for shifts, pose, free in _beside_truth(fit.states)
     ]
-    if len(known) < MIN_PHOTOGRAPHS:
-        return Field()
-    sums, shares = map(np.array, zip(*known, strict=True))
-    return field_of(sums, shares, lengths)
+    return field_of(known if len(known) >= MIN_PHOTOGRAPHS else [], lengths)
 
 
-def _beside_truth(states: Sequence[MarkerState]) -> tuple[Floats, Floats] | None:
-    """Return the shifts (8 n,) of corners beside the truth, and how they change with it (8 n, k).
+def _beside_truth(states: Sequence[MarkerState]) -> list[tuple[Floats, Floats, Floats]]:
+    """Return the shifts (8 n,) of a photograph's corners beside the truth, and how they change.
 
-    It has the print's size, and, unless a file's poses are exact, one pose of the board, fitted to
-    all corners; None without such a pose.
+    By one pose of the board (8 n, 6), which is fitted to all corners, and which a file's exact
+    poses do not have (8 n, 0); then by the print's size, and by the camera's numbers that are
+    themselves estimates, those with standard deviations (8 n, 1 + c). Nothing without such a pose.
     """
     places = [state.marker.shown for state in states]
-    shifts = np.concatenate([state.shifts for state in states])
+    first, shifts = places[0], np.concatenate([state.shifts for state in states])
     quads = np.array([state.marker.corners_px for state in states])
     size = (quads - quads.mean(axis=1, keepdims=True)).reshape(-1, 1)
-    if places[0].source == TruthSource.poses_file:
-        return shifts.ravel(), size
+    if first.source == TruthSource.poses_file:
+        return [(shifts.ravel(), size[:, :0], size)]
     corners = np.array([
         each.on_board.board.corners_m[each.on_board.number] for each in places if each.on_board
     ])
+    if len(corners) < MIN_SHIFTED_MARKERS:
+        return []
     frames_px = np.array([[state.marker.frame_px] for state in states])
-    pixels = (quads + frames_px).reshape(-1, 2) + shifts
-    points = corners.reshape(-1, 3)
-    first, used = places[0], np.ones(len(points), dtype=bool)
+    pixels, points = (quads + frames_px).reshape(-1, 2) + shifts, corners.reshape(-1, 3)
     start = of_board(first.rotation, first.translation, marker_frame(corners[0])[1])
-    pose = cameras.fit_pose(first.camera, points, pixels, *start, used)
+    pose = cameras.fit_pose(first.camera, points, pixels, *start, np.ones(len(points), dtype=bool))
     if pose is None:
-        return None
-    _, explained, _ = cameras.derivatives(first.camera, points, pose.rotation, pose.translation)
-    return -pose.residuals.ravel(), np.hstack([explained, size])
+        return []
+    _, by_pose, by_camera = cameras.derivatives(first.camera, points, *pose[:2])
+    free = np.hstack([size, by_camera[:, :len(first.camera.sd)]])
+    return [(-pose.residuals.ravel(), by_pose, free)]
+
+
+def print_size(fits: Sequence[PhotographFit]) -> Estimate:
+    """Return the size of markers over the board's or the file's, by their fitted corners.
+
+    By least squares of all photographs, beside a pose of each and, where the camera was calibrated
+    from them, beside its numbers; nothing with too few photographs. The corners that a detector
+    finds are biased by blur, and so is the truth that they give of boards without a chessboard:
+    it is not used. The interval is the jackknife's, by photograph (Efron and Stein, "The jackknife
+    estimate of variance", 1981): the camera's error is in it.
+    """
+    known = []
+    for shifts, pose, free in (each for fit in fits for each in _beside_truth(fit.states)):
+        columns, (q, _) = np.column_stack([free, shifts]), np.linalg.qr(pose)
+        known.append(columns - q @ (q.T @ columns))
+    if len(known) < MIN_PHOTOGRAPHS:
+        return Estimate()
+    whole, *without = (
+        np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0][0] for rows in map(
+            np.concatenate, (known, *(known[:k] + known[k + 1:] for k in range(len(known)))))
+    )
+    return estimate(1.0 + whole + (len(known) - 1) * (np.mean(without) - np.array(without)))
 
 
 def _geometry_sums(
@@ -631,11 +650,6 @@ def _terms(
 
     ``optics`` and ``tested`` are variance, amount and bloom as found, and as they are judged.
     """
-    def of_photographs(
-        function: Callable[[MarkerState], float], middle: Callable[[Any], Any] = np.mean
-    ) -> Estimate:
-        return estimate(np.array([middle(list(map(function, fit.states))) for fit in fits]))
-
     def with_reach(name: str, parameter: str, field: Field, unknown: str) -> list[Term]:
         """Return the term of a field of shifts, and the term of its reach, kept with it."""
         term = judge(name, parameter, field.size_px, field.variance, unknown=unknown)
@@ -648,7 +662,7 @@ def _terms(
 
     judge = partial(judged, refused)
     black, white = (estimate(each) for each in np.transpose([fit.levels for fit in fits]))
-    ground = of_photographs(lambda state: state.marker.ground, np.median)
+    grounds = [np.median([state.marker.ground for state in fit.states]) for fit in fits]
     variances = [estimate(each) for each in np.transpose([fit.noise for fit in fits])]
     deviations = [each.mapped(lambda square: math.sqrt(max(square, 0.0))) for each in variances]
     noise = [
@@ -670,32 +684,22 @@ def _terms(
     widened += float(displaced(np.arange(60), decimation.estimate.value).var())
     variance, amount, bloom = zip(optics, tested, strict=True)
     blur = variance[0].mapped(lambda square: math.sqrt(max(square - widened, 0.0)))
-    scale, geometry, unknown = Estimate(), Field(), "only beside a board or exact poses"
-    source = fits[0].states[0].marker.shown.source
-    if source in (TruthSource.board_without_this_marker, TruthSource.poses_file):
-        scale, unknown = of_photographs(_scale), "too few photographs or markers"
-        geometry = geometry_field(fits, edges)
+    unknown = "too few photographs or markers beside a board or exact poses"
     # Noise is measured behind the compression, which at edges adds about what it takes from noise
     # in flat areas.
-    quality = of_photographs(lambda state: state.marker.shown.jpeg_quality)
+    quality = estimate(np.array([fit.states[0].marker.shown.jpeg_quality for fit in fits]))
     jpeg = judge("JPEG", "jpeg_quality", quality, unknown="no JPEG files with OpenCV's tables")
     return [
         decimation,
         Term("black", "black", black), Term("white", "white", white),
-        Term("around the marker", "background", ground),
+        Term("around the marker", "background", estimate(np.array(grounds))),
         judge("blur", "blur_px", blur, variance[1]),
         judge("sharpening", "sharpening", *amount), judge("bloom (tone)", "bloom", *bloom),
         *(replace(each, kept=noisy, setting=table) for each in noise), *ragged,
-        judge("print's size", "marker_scale", scale, absent=1.0, unknown=unknown),
-        *with_reach("geometry", "geometry_px", geometry, unknown),
+        judge("print's size", "marker_scale", print_size(fits), absent=1.0, unknown=unknown),
+        *with_reach("geometry", "geometry_px", geometry_field(fits, edges), unknown),
         replace(jpeg, setting=round(np.nan_to_num(quality.value))),
     ]
-
-
-def _scale(state: MarkerState) -> float:
-    """Return the size of a marker over the board's or the file's, by its corners."""
-    arms = state.marker.corners_px - state.marker.corners_px.mean(axis=0)
-    return 1.0 + float((state.shifts * arms).sum() / (arms**2).sum())
 
 
 # --------------------------------------------------------------------------------------------------

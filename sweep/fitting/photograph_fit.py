@@ -135,7 +135,8 @@ def photograph_views(pipeline: Pipeline, most: int = MARKERS) -> tuple[Views, li
     """
     record, fixed = record_of(pipeline), pipeline.fixed
     fx, fy, cx, cy = (fixed[name] for name in VIEW)
-    camera = Calibration(None, None, fx, fy, cx, cy, tuple(fixed["distortion"]), (), ())
+    distortion, sd = (tuple(fixed[name]) for name in ("distortion", "calibration_sd"))
+    camera = Calibration(None, None, fx, fy, cx, cy, distortion, sd, ())
     views, count = Views(), 0
     on_board = record.on_board(record.marker_id)
     sizes = np.broadcast_to(pipeline.values_of("size_m"), len(on_board)).tolist()

@@ -429,8 +429,7 @@ def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> tuple[Cal
     )
     line = (
         f"camera: calibrated from {made.views} photographs, {made.rms_px:.2f} px RMS: {numbers} px "
-        "(standard deviations; truth_std has of them what truth and estimates do not share, the "
-        "interval of a fit's marker_scale nothing: it is too narrow)"
+        "(standard deviations; truth_std has of them what truth and estimates do not share)"
     )
     covariance = _covariance(camera, [used[i] for i in made.used], made)
     return replace(camera, covariance=tuple(covariance.ravel().tolist())), line

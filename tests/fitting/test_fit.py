@@ -63,18 +63,18 @@ def taken(folder, effects, seed, count):
     return (shots,), files
 
 
-def fitted(folder, effects, seed, count, markers=6):
-    folders, options = taken(folder, effects, seed, count)
-    return sweep.fit(*folders, **options, markers=markers, check=False)
-
-
 def terms_of(found):
     return {each.parameter: each for each in found.found.terms}
 
 
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory):
-    return [fitted(tmp_path_factory.mktemp("fit"), EFFECTS, seed, 8, 12) for seed in range(24)]
+    found = []
+    for seed in range(24):
+        folders, options = taken(tmp_path_factory.mktemp("fit"), EFFECTS, seed, 8)
+        options |= {} if seed % 2 else {"camera": "calibrate"}
+        found.append(sweep.fit(*folders, **options, markers=12, check=False))
+    return found
 
 
 @pytest.mark.evidence
@@ -83,10 +83,10 @@ def test_intervals_of_every_effect_hold_the_truth_and_the_scene_is_a_pipeline(se
     held = [[each[name].low <= TRUTH[name] <= each[name].high for name in TRUTH] for each in found]
     print(f"of {len(sets)} sets, intervals that hold the truth: {np.mean(held):.3f},",
           dict(zip(TRUTH, np.mean(held, axis=0).round(2).tolist(), strict=True)))
-    # Binomial: with 0.93 each, fewer than 13 of 24 have a probability of 2e-8. Shares of a set's
-    # ten deviate by 0.1: 0.83 is five standard deviations of their mean below 0.93.
-    assert np.mean(held, axis=0).min() > 0.53
-    assert np.mean(held) > 0.83
+    # Binomial: with 0.90 each, fewer than 12 of 24 have a probability of 1e-7. Shares of a set's
+    # ten deviate by 0.1: 0.82 is five standard deviations of their mean below 0.92.
+    assert np.mean(held, axis=0).min() > 0.49
+    assert np.mean(held) > 0.82
     scene = sweep.Pipeline.from_text(sets[0].text).fixed
     assert scene["blur_px"] == pytest.approx(0.6, rel=0.03)
     assert np.allclose(scene["noise_table"][1::2], 2.0, rtol=0.1)
@@ -109,7 +109,7 @@ def test_corners_follow_shifts_of_edges_and_of_smooth_fields_as_their_pixels_do(
 
 
 def test_copies_of_one_photograph_limit_nothing():
-    found = field_of(np.zeros((6, 2)), np.ones((6, 2, 3)), np.arange(1.0, 4.0))
+    found = field_of([(np.zeros(2), np.ones((2, 3)))] * 6, np.arange(1.0, 4.0))
     assert (found.size_px.low, found.size_px.high) == (0.0, np.inf)
 
 

@@ -29,6 +29,7 @@ from sweep.measure.flags import DetectionStatus
 from sweep.messages import quoted
 from sweep.store import files
 from sweep.store.locations import is_remote, remote_run_id, translate_errors
+from sweep.typing import Masks
 
 
 class StoreReplacedError(StoreError):
@@ -55,16 +56,30 @@ class CheckedReads(WrapperStore[Store]):
         The storage itself.
     url
         The store's, as the user gave it.
-    finished
-        Whether the store was finished when it was opened: then no chunk may be missing.
+    shown
+        Whether the block at each index along the scene axes is shown: chunks of others are not
+        read, but have fill values. None: all blocks.
+    names
+        Variable -> name of its chunks, to be filled in with indices along those axes.
     """
 
-    def __init__(self, store: Store, url: str, *, finished: bool) -> None:
+    def __init__(
+        self, store: Store, url: str, shown: Masks | None = None,
+        names: Mapping[str, str] | None = None,
+    ) -> None:
         super().__init__(store)
-        self._url, self._finished = url, finished
+        self._url, self._shown, self._names = url, shown, names or {}
 
     def _with_store(self, store: Store) -> CheckedReads:
-        return CheckedReads(store, self._url, finished=self._finished)
+        return CheckedReads(store, self._url, self._shown, self._names)
+
+    def _is_shown(self, variable: str, chunk: str) -> bool:
+        """Return whether the block is shown that a variable's chunk, such as "c.0.1", is of."""
+        if self._shown is None or variable not in self._names:
+            return True
+        filled_in = dict(zip(self._names[variable].split(files.SEPARATOR),
+                             chunk.split(files.SEPARATOR), strict=True))
+        return bool(self._shown[tuple(int(filled_in[f"{{{k}}}"]) for k in range(self._shown.ndim))])
 
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
@@ -74,15 +89,17 @@ class CheckedReads(WrapperStore[Store]):
         Raises
         ------
         DamagedStoreError
-            If it is a chunk that was changed, or one of a finished store that is missing.
+            If it is a chunk of a block that is shown, and was changed or is missing.
         StoreError
             If it cannot be read.
         """
+        array, _, name = key.rpartition("/")
+        is_chunk = name.partition(files.SEPARATOR)[0] == "c"
+        if is_chunk and not self._is_shown(array, name):
+            return None
         with translate_errors(self._url, "read"):
             value = await self._store.get(key, prototype, byte_range)
-        wrong = self._finished if value is None else not (
-            byte_range or files.is_sound(value.to_bytes()))
-        if wrong and "/c" in key and not key.endswith("zarr.json"):  # of chunks alone
+        if is_chunk and (value is None or not (byte_range or files.is_sound(value.to_bytes()))):
             raise damaged(self._url, f"{key}: {'missing' if value is None else files.CHANGED}")
         return value
 

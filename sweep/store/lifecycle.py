@@ -10,7 +10,7 @@ import shutil
 import time
 import uuid
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from zlib import crc32
@@ -259,8 +259,8 @@ def open_unchecked(url: str, mode: Literal["r", "r+"] = "r") -> RunStore:
         )
         cut = Blocks(
             tuple(len(axis) for axis in pipeline.experiment.scene_axes), tuple(metadata["block"]))
-        checked = blocks.CheckedReads(storage, url, finished=metadata["finished"])
-        group = zarr.open_group(checked, mode=mode, zarr_format=3, use_consolidated=False)
+        group = zarr.open_group(
+            blocks.CheckedReads(storage, url), mode=mode, zarr_format=3, use_consolidated=False)
         return RunStore(url, storage, group, pipeline, metadata["run_id"], cut)
     except UNREADABLE:
         raise StoreError(locations.not_a_store(url)) from None
@@ -461,13 +461,16 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
     store = open_store(path_of("store", url))
     import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
 
-    done = blocks.check_whole(store)
+    # A writer may be at any other block meanwhile, or may have been killed in the midst of one.
+    shown = np.zeros(store.blocks.counts, dtype=bool)
+    shown.flat[list(blocks.check_whole(store))] = True
+    reads = blocks.CheckedReads(store.storage, store.url, None if shown.all() else shown, {
+        variable: name for variable, (name, _) in store.chunks.items()})
     small = store.pipeline.experiment.bytes_of(math.prod(store.blocks.lengths)) <= read_bytes
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
         dataset: xr.Dataset = xr.open_zarr(
-            store.group.store, chunks=None if small else _together(store), consolidated=False,
-            zarr_format=3)
+            reads, chunks=None if small else _together(store), consolidated=False, zarr_format=3)
         dataset = dataset.load() if small else dataset
     # Columns of an axis are short and asked for one by one; much of xarray and pandas does not
     # support NumPy's strings of variable length.
@@ -477,35 +480,11 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
                else value.to_numpy(), value.attrs)
         for name, value in dataset.coords.items() if value.dtype.kind == "T" or name in columns
     }
-    dataset = dataset.assign_coords(loaded)
-    if len(done) < len(store.blocks):
-        dataset = _only_committed(store, dataset, done)
     ordered = [
         each.name for each in (*schema.VARIABLES.values(), *schema.PHOTOGRAPH_SCHEMA)
         if each.name in dataset.data_vars
     ]
-    return dataset[ordered]
-
-
-def _only_committed(store: RunStore, dataset: xr.Dataset, done: Collection[int]) -> xr.Dataset:
-    """Return results with fill values in all blocks but those that are ``done``.
-
-    A writer may be at any other block meanwhile, or may have been killed in the midst of one.
-    """
-    import xarray as xr  # noqa: PLC0415  (as above)
-
-    shown = np.zeros(store.blocks.counts, dtype=bool)
-    shown.flat[list(done)] = True
-    shown = shown[np.ix_(*(np.arange(length) // extent for extent, length in zip(
-        store.blocks.extents, store.blocks.lengths, strict=True)))]
-    mask = xr.DataArray(shown, dims=[axis.name for axis in store.pipeline.experiment.scene_axes])
-    if dataset.chunks:  # Dask would make chunks of it for each variable
-        mask = mask.chunk(_together(store))
-    masked = {
-        variable.name: dataset[variable.name].where(mask, variable.fill).astype(variable.dtype)
-        for variable in store.variables
-    }
-    return dataset.assign(masked)  # coordinates stay coordinates
+    return dataset.assign_coords(loaded)[ordered]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -636,7 +615,8 @@ def open_finished(url: str, mode: Literal["r", "r+"] = "r") -> RunStore:
 
 def names_store(path: str | os.PathLike[str]) -> bool:
     """Return whether a path or URL leads to a folder or a server, where no pipeline file is."""
-    return "://" in os.fspath(path) or Path(path).is_dir()
+    # Path.is_dir would raise of a name that is too long.
+    return "://" in os.fspath(path) or os.path.isdir(path)  # noqa: PTH112
 
 
 def store_of(source: object, store: str | os.PathLike[str] | None) -> str | os.PathLike[str] | None:

@@ -152,7 +152,7 @@ def exists(url: str) -> bool:
             os.stat(url)  # noqa: PTH116  (as os.lstat)
     except (FileNotFoundError, NotADirectoryError):
         return False
-    except OSError as error:
+    except (OSError, ValueError) as error:  # of a name with a zero byte
         raise StoreError(f"{plain(url, 300)}: cannot be read: {reason_of(error)}") from None
     return True
 

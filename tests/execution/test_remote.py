@@ -93,12 +93,14 @@ def bucket(tmp_path_factory):
 @pytest.mark.system
 @pytest.mark.usefixtures("bucket")
 def test_server_refuses_changes_while_a_process_writes(monkeypatch):
-    monkeypatch.setattr("sweep.store.lock.SILENCE_S", 1.5)
+    monkeypatch.setattr("sweep.store.lock.SILENCE_S", 6.0)  # a key is renewed each second
     url = "s3://bucket/written.zarr"
     pipeline = Pipeline.from_text("axes.trial = 4\n[pose]\njitter_px = 0.5\nside_px = 40")
     store = create_store(url, pipeline, (2,))
     with writing(url, store.storage):
-        time.sleep(1.8)  # its key is renewed
+        before = contents("written.zarr/")
+        while contents("written.zarr/") == before:  # until its key is renewed
+            time.sleep(0.1)
         assert is_written(store.storage)
         for change in (
             lambda: remove_store(url), lambda: reopen(store),

@@ -61,30 +61,24 @@ def test_a_run_that_another_rule_of_stopping_has_overtaken_changes_nothing(tmp_p
     assert open_store(begun.url).pipeline.stopping == strict.stopping
 
 
-@pytest.fixture
-def another_storage(monkeypatch):
-    """A storage that is no folder of this machine, as an object store's."""
-    monkeypatch.setattr(locks, "SILENCE_S", 0.6)
-    return MemoryStore()
-
-
-def test_the_key_of_a_process_that_was_killed_is_free_after_a_while(another_storage):
-    write_files(another_storage, {f"{locks.CHANGE}dead": str(time.time()).encode()})
-    assert is_written(another_storage)
-    time.sleep(0.7)
-    with changing("s3://a", another_storage):
+def test_the_key_of_a_process_that_was_killed_is_free_after_a_while():
+    storage, dead = MemoryStore(), f"{locks.CHANGE}dead"  # as on an object store: no folder
+    write_files(storage, {dead: str(time.time()).encode()})
+    assert is_written(storage)
+    write_files(storage, {dead: str(time.time() - locks.SILENCE_S).encode()})
+    with changing("s3://a", storage):
         for other in (writing, changing):
-            with pytest.raises(StoreError, match="is writing it"), other("s3://a", another_storage):
+            with pytest.raises(StoreError, match="is writing it"), other("s3://a", storage):
                 pass
-    assert set(files_in(another_storage)) <= {f"{locks.CHANGE}dead"}
+    assert set(files_in(storage)) <= {dead}
 
 
-def test_of_many_changes_of_an_object_store_at_once_one_at_most_is_inside(another_storage):
-    inside, most, refused = [], [], []
+def test_of_many_changes_of_an_object_store_at_once_one_at_most_is_inside():
+    storage, inside, most, refused = MemoryStore(), [], [], []
 
     def change(number):
         try:
-            with changing("s3://a", another_storage):
+            with changing("s3://a", storage):
                 inside.append(number)
                 most.append(len(inside))
                 time.sleep(0.01)

@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 import zarr
 import zarr.storage._local as local
+from zarr.abc.store import OffsetByteRequest
+from zarr.buffer import default_buffer_prototype
+from zarr.core.sync import sync
 
 import sweep
 from support.stores import by_hand, editable, same
@@ -129,6 +132,18 @@ def test_opened_store_shows_the_blocks_committed_until_then(pipeline, tmp_path, 
     assert before.tolist() == after.estimate.to_numpy().tolist() == [[1, 1], [1, 1], [0, 0], [0, 0]]
     assert np.isnan(after.rotation_error_deg[2:]).all()
     assert np.isfinite(after.rotation_error_deg[:2]).all()
+    with sweep.open(url) as opened:  # of an unfinished store, too, what was committed is there
+        chunk = Path(url, "estimate", "c.0.0")
+        hidden = chunk.rename(chunk.with_name("hidden"))
+        with pytest.raises(DamagedStoreError, match=r"read\.zarr: damaged: estimate/c\.0\.0: miss"):
+            opened.load()
+        chunk.write_bytes(b"changed")
+        reads = store.group.store.with_read_only(read_only=True)
+        asked = "estimate/c.0.0", default_buffer_prototype()
+        with pytest.raises(DamagedStoreError, match="changed"):  # in another mode, too
+            sync(reads.get(*asked))
+        assert sync(reads.get(*asked, OffsetByteRequest(2))).to_bytes() == b"anged"  # not checked
+        hidden.rename(chunk)
     close(open_store(url, "r+"))
     assert (sweep.open(url).estimate == 1).all()
     monkeypatch.setattr("sweep.store.files.list_folder", lambda *_: [])

@@ -63,7 +63,7 @@ class ArgumentError(SweepError, ValueError):
         self.argument, self.value, self.problem = argument, value, problem
 
     def __str__(self) -> str:
-        given = f" = {self.value}" if str(self.value) else ""
+        given = f" = {plain(self.value, 300)}" if str(self.value) else ""
         return f"{self.argument}{given}: {self.problem}"
 
 
@@ -98,8 +98,8 @@ def texts_of(argument: str, given: object, expected: str = "texts") -> list[str]
     ArgumentError
         If it is neither.
     """
-    texts: list[Any] = [given] if isinstance(given, str) or not isinstance(
-        given, Iterable) else [*given]
+    texts: list[Any] = [given] if isinstance(given, str) or not (  # nor an array of no dimension
+        isinstance(given, Iterable) and getattr(given, "ndim", True)) else [*given]
     if not all(isinstance(each, str) for each in texts):
         raise ArgumentError(argument, " ".join(repr(given)[:60].split()), f"expected {expected}")
     return texts

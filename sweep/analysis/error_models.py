@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import math
@@ -821,6 +822,42 @@ def _of_cells(judged: Floats) -> Values:
 
 
 # --------------------------------------------------------------------------------------------------
+# Numbers of poses, as a user gives them.
+
+def rows_of(**given: tuple[ArrayLike, int]) -> list[Floats]:
+    """Return numbers of n poses as arrays (n,), or (n, width), by the names of arguments.
+
+    Each is given with its width, in any shape that has it as the last dimension, or before a last
+    one of 1, as OpenCV's vectors do. Numbers of one pose are repeated where others are of n.
+
+    Raises
+    ------
+    ArgumentError
+        One line on the first that is no such array, or of another number of poses.
+
+    Examples
+    --------
+    >>> [rows.shape for rows in rows_of(rvec=([0, 0, 1], 3), ambiguity=([0.5, 0.25], 1))]
+    [(2, 3), (2,)]
+    """
+    found = {}
+    for name, (values, width) in given.items():
+        shape, fits = (-1, width) if width > 1 else (-1,), False
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            array = np.asarray(values, dtype=np.float64)
+            ends = {array.shape[-1:], array.shape[-2:]}
+            fits = width == 1 or not ends.isdisjoint({(width,), (width, 1), (0,)})
+        if not fits:
+            raise ArgumentError(name, values, f"expected numbers {shape}".replace("-1", "n"))
+        found[name] = array.reshape(shape)
+    count = next((len(rows) for rows in found.values() if len(rows) != 1), 1)
+    for name, rows in found.items():
+        if len(rows) not in (1, count):
+            raise ArgumentError(name, f"of {len(rows):,} poses", f"expected {count:,}, or one")
+    return [np.broadcast_to(rows, (count, *rows.shape[1:])) for rows in found.values()]
+
+
+# --------------------------------------------------------------------------------------------------
 # Values of an error model at poses: bias, standard deviation and covariance.
 
 def model_errors(
@@ -854,7 +891,7 @@ def model_errors(
     Raises
     ------
     ArgumentError
-        If there are several models, or no side where it does not follow.
+        If there are several models, no side where it does not follow, or what is no number (n,).
 
     Notes
     -----
@@ -878,9 +915,10 @@ def model_errors(
         if model.attrs["focal_size_varies"]:
             raise ArgumentError("side_px", None, "expected the side: it varies in the store")
         with np.errstate(divide="ignore"):
-            side_px = model.attrs["focal_size_px_m"] / np.asarray(distance_m, dtype=np.float64)
-    values = np.broadcast_arrays(*(np.atleast_1d(np.asarray(each, dtype=np.float64)) for each in (
-        distance_m, side_px, viewing_angle_deg, np.nan if bearing_deg is None else bearing_deg)))
+            side_px = model.attrs["focal_size_px_m"] / rows_of(distance_m=(distance_m, 1))[0]
+    values = rows_of(
+        distance_m=(distance_m, 1), side_px=(side_px, 1), viewing_angle_deg=(viewing_angle_deg, 1),
+        bearing_deg=(np.nan if bearing_deg is None else bearing_deg, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         at = np.stack([condition.scaled(each) for condition, each in zip(
             CONDITIONS.values(), values, strict=True)], axis=-1)
@@ -945,7 +983,7 @@ def model_covariance(
     >>> pose["covariance"].shape, bool(pose["covariance"][0, 2, 2] > 0)
     ((1, 6, 6), True)
     """
-    position = np.atleast_2d(np.asarray(position_m, dtype=np.float64))
+    (position,) = rows_of(position_m=(position_m, 3))
     values = model_errors(
         model, position[:, 2], viewing_angle_deg, side_px, bearing_of(position))
     turn = np.kron(np.eye(2), sight_rotation(position))  # of position and rotation each

@@ -1027,18 +1027,18 @@ def requirement_limits(
     >>> limit["limited_by"].item(), limit["fails_at"].item()
     ('detection_rate >= 0.6', 10.0)
     """
-    rule = dataset.stopping_rule(results)
+    rule, require = dataset.stopping_rule(results), texts_of(
+        "require", () if require is None else require)
     ends: tuple[int, ...] = (results.sizes.get(DRAWS, 1),)
     if rule is not None and rule.kind == "along":
         ends = rule.ends
-        require, along = require or rule.requirements, along or rule.along
+        require, along = require or [*rule.requirements], along or rule.along
         if along == rule.along:
             per = rule.per if per is None else per
             at_all = rule.at_all if at_all is None else at_all
-    require = texts_of("require", require or ())
     required = parse_requirements(require)
     require_order(results, along)
-    together = [name for name in as_names(at_all or ()) if name != along]
+    together = [name for name in as_names(() if at_all is None else at_all) if name != along]
     names = [name for name in (as_names(per) if per is not None else axes_of(results, Stage.scene))
              if name != along and (per is not None or name not in (DRAWS, *together))]
     if overlap := [name for name in together if name in names]:

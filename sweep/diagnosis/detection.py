@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from sweep.analysis.dataset import bearing_of, focal_size_of, sight_rotation, viewing_angle_of
-from sweep.analysis.error_models import FRONTAL_DEG, differences, hat_basis
+from sweep.analysis.error_models import FRONTAL_DEG, differences, hat_basis, rows_of
 from sweep.errors import DatasetError
 from sweep.measure.flags import EstimateStatus, Flipped
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
@@ -113,10 +113,15 @@ class DetectionModel:
             the simulation has too few poses, and for poses that cannot be (NaN, behind the camera).
             A pose does not show which camera, dictionary, refinement and light it comes from: the
             model is of those that were simulated alone.
+
+        Raises
+        ------
+        ArgumentError
+            If one is no array of numbers of its shape, or of another number of poses.
         """
-        rvec, tvec = (np.asarray(each, np.float64).reshape(-1, 3) for each in (rvec, tvec_m))
         middle = math.exp(float(np.median(self.ambiguity_knots)))
-        ratio = np.broadcast_to(np.ravel(middle if ambiguity is None else ambiguity), len(tvec))
+        rvec, tvec, ratio = rows_of(rvec=(rvec, 3), tvec_m=(tvec_m, 3), ambiguity=(
+            middle if ambiguity is None else ambiguity, 1))
         # Of what no solver returns nothing is known, and the others are not disturbed by it.
         known = (np.abs(np.hstack([rvec, tvec])) < MOST).all(axis=1) & (tvec[:, 2] > 0)
         known &= (ratio >= 0) & (ratio <= max(1.0, math.exp(self.ambiguity_knots[-1])))

@@ -201,7 +201,7 @@ def read_observations(
     believed = camera if camera is None or isinstance(camera, Calibration) else camera_of_file(
         path_of("camera", camera))
     if IMAGE in cells:
-        images = [folder / name for name in cells[IMAGE]]
+        images = [folder / str(name) for name in cells[IMAGE]]
         table[CORNERS] = _detected(table, images, believed, settings)
     there = table.notna()
     for name, others in NEEDED.items():

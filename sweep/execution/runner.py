@@ -387,7 +387,7 @@ def limit(
     from sweep.analysis.requirements import requirement_limits  # noqa: PLC0415  (slow to import)
 
     errors.check_positive("max_trials", max_trials, most=MAX_VALUES)
-    chosen = [*errors.texts_of("settings", settings),
+    chosen = [*(settings := errors.texts_of("settings", settings)),
               *search_settings(require, along, per, at_all, max_trials)]
     if isinstance(pipeline, (str, os.PathLike)) and lifecycle.names_store(pipeline):
         stored = lifecycle.open_store(os.fspath(pipeline))
@@ -403,8 +403,8 @@ def limit(
     try:
         read = lifecycle.read_pipeline(pipeline, chosen)
     except errors.PipelineError as error:
-        if NO_TRIALS not in str(error):
-            raise
+        if others := [fault for fault in error.faults if NO_TRIALS not in fault]:
+            raise errors.PipelineError(others) from None
         chosen += search_settings(max_trials=MAX_TRIALS)
         read = lifecycle.read_pipeline(pipeline, chosen)
     searched = getattr(read.stopping, "along", "")

@@ -469,7 +469,7 @@ def search_settings(
     ['require.all=["detection >= 0.9"]', 'search.along="distance_m"', 'search.max_trials=600']
     """
     given: dict[str, Any] = {
-        f"{REQUIRE}.all": texts_of("require", require or ()) or None,
+        f"{REQUIRE}.all": texts_of("require", () if require is None else require) or None,
         f"{SEARCH}.along": str(along) if along else None,
         f"{SEARCH}.per": None if per is None else texts_of("per", per),
         f"{REQUIRE}.per": None if at_all is None else texts_of("at_all", at_all),

@@ -21,7 +21,7 @@ from scipy.linalg import block_diag
 from sweep.analysis import simulation_gap
 from sweep.analysis.comparisons import GAP_STATISTICS
 from sweep.analysis.estimator import TAIL
-from sweep.errors import ArgumentError
+from sweep.errors import ArgumentError, texts_of
 from sweep.execution.runner import execute
 from sweep.experiment.document import document_text, read_document
 from sweep.experiment.parameters import PHOTOGRAPHS
@@ -948,8 +948,8 @@ def fit(
     """
     if markers not in range(1, 1001):
         raise ArgumentError("markers", markers, "expected a whole number from 1 to 1000")
-    if all(prepare.setting_name(each) in ("dictionary", "size_m") for each in settings):
-        settings = [*settings, COMPARED]
+    if {*map(prepare.setting_name, texts_of("settings", settings))} <= {"dictionary", "size_m"}:
+        settings = [*texts_of("settings", settings), COMPARED]
     with tempfile.TemporaryDirectory() as written:
         home = Path(written).resolve()
         prepared = prepare.prepare(

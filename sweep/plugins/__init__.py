@@ -85,9 +85,11 @@ class Plugin:
 
     def __post_init__(self) -> None:
         """Refuse values that no plug-in has."""
-        for name, (fits, expected) in EXPECTED.items():
-            if hasattr(self, name) and not fits(getattr(self, name)):
-                raise ValueError(f"{name} = {getattr(self, name)!r}: expected {expected}")
+        for name in [each for each in EXPECTED if hasattr(self, each)]:
+            (fits, expected), value = EXPECTED[name], getattr(self, name)
+            # Of arrays lists and numbers: they are compared as a whole, not by element.
+            if not fits(value.tolist() if hasattr(value, "tolist") else value):
+                raise ValueError(f"{name} = {value!r}: expected {expected}")
 
 
 @dataclass(frozen=True, kw_only=True)

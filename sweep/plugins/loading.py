@@ -354,8 +354,7 @@ def load(kind: str, name: str, folder: str) -> tuple[Plugin, str, Versions]:
         digest = hashlib.sha256(source).hexdigest()
         names, attribute = vars(_module(str(path), digest, source)), name.rpartition(":")[2]
         if attribute not in names:
-            known = [each for each in names if not each.startswith("_")]
-            raise PluginError(f"a name in {path.name}{nearest(attribute, known)}")
+            raise PluginError(f"a name in {path.name}{nearest(attribute, names)}")
         found = names[attribute]
     else:
         entry = _entry_point(kind, name)

@@ -914,7 +914,8 @@ def measure_tradeoff(
     if criterion not in CRITERIA:
         raise ArgumentError("criterion", criterion, f"expected one of {', '.join(CRITERIA)}"
                             + nearest(criterion, CRITERIA))
-    for name, value in (("budget_ms", budget_ms), ("limit_s", limit_s)):
+    for name, value in (
+            ("budget_ms", budget_ms), ("limit_s", "" if limit_s is None else limit_s)):
         check_positive(name, value, "expected a finite number above 0")
     figure = figure_file(output)
     store = path_of("store", store)

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from sweep.diagnosis.detection import DetectionModel, error_model, judged, widened
-from sweep.errors import DatasetError
+from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import EstimateStatus, Flipped
 from sweep.model.pose import mirrored, rotation_of_angles, rotation_of_vector, vector_of_rotation
 
@@ -90,6 +90,11 @@ def test_outside_what_was_simulated_nothing_is_known_also_from_json(model):
     assert np.isnan(found.drop_vars("known").isel(pose=slice(1, None)).to_array()).all()
     pose, text = ([[3.0, 0.2, 0.0]], [[0.1, 0.0, 2.0]], 0.3), model.to_json()
     assert model.at(*pose).equals(DetectionModel.from_json(text).at(*pose))
+    for name, wrong in (
+            ("rvec", "abc"), ("rvec", [1.0]), ("tvec_m", [[1.0, 2.0]]), ("ambiguity", [0.1, 0.2])):
+        poses = {"rvec": [[3.0, 0.2, 0.0]] * 3, "tvec_m": [[0.1, 0.0, 2.0]] * 3, name: wrong}
+        with pytest.raises(ArgumentError, match=rf"^{name} = .*: expected [^\n]*$"):
+            model.at(**poses)
     for part, edited in (
             ("flips", "flip"), ('"poses": [', '"poses": [0, '), (" 0.0,", "99,"), ('m": ', 'm": -'),
             ("0.0\n  ]", "NaN\n  ]"), ("{", "[" * 100_000)):

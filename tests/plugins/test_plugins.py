@@ -347,6 +347,8 @@ def test_what_a_function_margin_px_raises_is_the_plug_in_s_fault(bad):
      "the distribution not-there-9, which is not installed: `pip install not-there-9`"),
     ("from sweep.plugins import *\nD = DetectorPlugin(make=print, corner_order=(0., 1., 2., 3.))",
      "corner_order = (0.0, 1.0, 2.0, 3.0): expected the numbers 0 to 3, each once (line 2"),
+    ("from sweep.plugins import *\nimport numpy\nD = EffectPlugin(apply=print, step=numpy.ones(2))",
+     "step = array([1., 1.]): expected light or signal (line 3"),
     (MINE.replace("shift_px", "tilt_deg").replace("TURNED", "D"),
      "another name for its setting tilt_deg: the pipeline has this one"),
 ])

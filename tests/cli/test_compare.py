@@ -49,13 +49,14 @@ def test_photographs_are_simulated_and_compared_in_one_command(tmp_path):
     assert "<svg" in figure.read_text()
     assert "5 photographs and their twins" in out
     assert (tmp_path / "shots-same.zarr").is_dir()
-    code, out, _ = command(
-        "compare", tmp_path / "shots.zarr", tmp_path / "shots-same.zarr", "--json")
+    stores = tmp_path / "shots.zarr", tmp_path / "shots-same.zarr"
+    code, out, _ = command("compare", *stores, "--json")
     (median,) = (each for each in json.loads(out)["rows"]
                  if each["statistic"].startswith("rotation median")
                  and each["cornerRefinementMethod"] == "subpix")
     # The photographs were rendered with this scene, but for the board around each marker.
     assert 0.5 < median["gap"]["value"] < 2
+    assert json.loads(sweep.compare(*stores, reuse=[]).to_json())["rows"] == json.loads(out)["rows"]
     simulated = sweep.twins(tmp_path / "shots.zarr", scene)  # finished already
     assert simulated.sizes["trial"] == len(POSES)
     scene.write_text("[scene]\nblur_px = 3\n")

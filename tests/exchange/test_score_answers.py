@@ -238,6 +238,7 @@ BAD = {
     "a doubled row": (GOOD + "{0},0,1,2,3,4,5,6,7,9\n", "line 3: image {0} has ID 0 twice, here"),
     "other separators": (GOOD.replace(",", "|"), "between commas, semicolons or tabs, image|id"),
     "a cell without end": (GOOD + "x" * 200_000, "line 3: field larger than field limit"),
+    "a wide row": (GOOD + "{0},1,1,2,3,4,5,6,7,8,9\n", "line 3: 11 values; expected 10, as the"),
     "NaN": (GOOD.replace(",8", ",nan"), "line 2: y3 = nan: expected a finite number"),
     "a quaternion of length 2": (
         "image,id,qw,qx,qy,qz,tx,ty,tz\n{0},0,2,0,0,0,0,0,1\n", "a quaternion of length 2"),

@@ -204,6 +204,14 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
 
     # Panels of two standard deviations and a cut at four: 1e-3 of the contrast.
     assert np.abs(work.images[0][used] - exact()).max() < 1e-3
+    # An image of another pose is drawn anew before the covariance is taken from it.
+    covariances = np.zeros((2, 6, 6))
+    for covariance, roll_deg in zip(covariances, (0, 6), strict=True):
+        other = rotation(0, 0, roll_deg) @ turn
+        draw(view, state_of(other, position, 0.8, np.array([0.0, 0.0, 1.0])), work)
+        real.judge(view, state, work, covariance)
+    assert covariances[0].any()
+    np.testing.assert_array_equal(*covariances)
     step = 1e-3
     slopes = [
         (exact(-step) - exact(step)) / (2 * step), (exact(0, -step) - exact(0, step)) / (2 * step),

@@ -442,7 +442,7 @@ class Difference(NamedTuple):
 
         Intervals (of ratios that of the logarithm) narrow with the root of the number of draws.
         The difference may be a standard error nearer to the bound than it seems, so that most runs
-        with so many draws decide (`pytest -m evidence tests/report/test_false_better.py`).
+        with so many draws decide (`pytest -m evidence tests/report/test_trade_report.py`).
         """
         equal = self.column.level or 0.0
         with np.errstate(all="ignore"):

@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import pytest
 
+from benchmarks import bench_analysis
 from support.small_datasets import ALL, mixed
 from sweep.analysis import (
     compare,
@@ -67,3 +68,12 @@ def test_blocks_of_any_size_and_variables_chunked_each_in_its_own_way_give_the_s
     chunked["detection"] = RESULTS["detection"]  # in memory beside lazy ones
     chunked["rotation_error_rad"] = RESULTS["rotation_error_rad"].chunk(xyz=1)
     assert_same(CALLS[call](chunked), call)
+
+
+@pytest.mark.evidence
+def test_ten_million_poses_are_analysed_below_a_gigabyte(tmp_path, claim):
+    store, _ = bench_analysis.write_store(tmp_path, 10**7)
+    for name in ("error_statistics, all", "error_statistics", "ambiguity", "compare"):
+        peak = bench_analysis.measured(store, bench_analysis.CALLS[name])["peak"]
+        claim("memory of an analysis of 10^7 poses", "a fresh interpreter", peak / 1e6, "MB")
+        assert peak < 1e9

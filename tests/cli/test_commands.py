@@ -19,7 +19,10 @@ from support.reports import command
 from sweep import cli, installation
 from sweep.cli.command import print_error
 from sweep.cli.parser import COMMANDS, build_parser
+from sweep.cli.reference import TABLES
 from sweep.errors import ArgumentError, PipelineError, RunError, StoreError
+from sweep.experiment.parameters import PARAMETERS, SECTIONS
+from sweep.experiment.schema import VARIABLES
 from sweep.measure.flags import DetectionStatus
 from sweep.report.table import to_json
 
@@ -139,3 +142,12 @@ def test_each_kind_of_value_has_one_form():
         "path": "a", "many": [1, True], "flag": "detected", "number": 0.5,
         "low": None, "low_flag": "-infinite",
     }
+
+
+def test_every_parameter_and_variable_stands_in_the_table_of_its_subject():
+    for section in SECTIONS:
+        names = [row[0] for row in TABLES[section]().rows]
+        assert names == [p.name for p in PARAMETERS.values() if p.section == section]
+    assert [row[0] for row in TABLES["variables"]().rows] == [*VARIABLES]
+    assert all(all(row[-1:]) for name in TABLES for row in TABLES[name]().rows
+               if name != "variables")

@@ -48,27 +48,23 @@ def test_what_data_may_cause_is_no_fault_of_the_machine():
     assert machine_fault(hidden) is None
 
 
-@pytest.mark.parametrize("place", [place for place in machine_faults.PLACES if place != "set"])
-@pytest.mark.parametrize("fault", ["disk", "memory", "import", "compiler", "opencv memory"])
-def test_no_scene_is_flagged_failed_by_a_fault_of_the_machine(fault, place):
+@pytest.mark.parametrize(("place", "fault", "work", "named"), [
+    *((place, fault, lambda: run_cells(PIPELINE, [np.arange(4)]), None)
+      for place in machine_faults.PLACES if place != "set"
+      for fault in ("disk", "memory", "import", "compiler", "opencv memory")),
+    *((place, "import", lambda: warm_up(PIPELINE), "file too short")  # before any block
+      for place in ("render_all", "build")),
+])
+def test_a_fault_of_the_machine_is_told_as_one_and_flags_no_scene(place, fault, work, named):
+    warm_up(PIPELINE)
     machine_faults.inject(fault, place, 0)
     try:
-        with pytest.raises(MachineFaultError):
-            run_cells(PIPELINE, [np.arange(4)])
+        with pytest.raises(MachineFaultError, match=named):
+            work()
     finally:
         machine_faults.clear()
     assert not run_cells(PIPELINE, [np.arange(4)]).failures
 
-
-@pytest.mark.parametrize("place", ["render_all", "build"])
-def test_machine_that_cannot_compute_a_standard_scene_is_told_before_any_block(place):
-    warm_up(PIPELINE)
-    machine_faults.inject("import", place, 0)
-    try:
-        with pytest.raises(MachineFaultError, match="file too short"):
-            warm_up(PIPELINE)
-    finally:
-        machine_faults.clear()
 
 # The caller's number of OpenCV threads is its own again after a call.
 

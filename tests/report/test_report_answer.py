@@ -1,4 +1,4 @@
-"""The answer of a report: line, table and JSON agree, and are what plain NumPy finds."""
+"""The answer of a report is what plain NumPy finds; error models as JSON by the guide's reader."""
 
 import io
 import json
@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.pose_errors import poses_with_law, power_law, reader_of_the_guide
 from support.reports import command, made
 from support.small_datasets import perfect, with_detected
-from sweep.analysis import compare, error_statistics
+from sweep.analysis import compare, error_models, error_statistics, model_errors
+from sweep.analysis.error_models import Use
 from sweep.analysis.requirements import Decision
 from sweep.experiment.pipeline import Pipeline
+from sweep.report.findings import error_model_document, error_model_table
 from sweep.report.report_data import ReportData
-from sweep.report.table import number
+from sweep.report.table import number, to_json
 from sweep.report.write_report import answer
 from sweep.store.lifecycle import open_dataset
 
@@ -185,3 +188,57 @@ def test_a_wrong_belief_is_never_named():
         assert "wrong" not in shown.headline
     (table,) = (each for each in shown.tables if each.caption.startswith("Configurations, with"))
     assert sum("(wrong)" in row[0] for row in table.rows) == 4
+
+
+TITLE = 'a " */ quote\\ \n #include <x> {{ 7 * 7 }} {% raw %} """ \u2028 </script> \udcff'
+ABOUT = {"store": 'runs/"odd" */ name.zarr', "title": TITLE, "fingerprint": {}}
+
+
+@pytest.fixture(scope="module")
+def models():
+    axes = {"distance_m": [1.0, 2.0, 4.0], "tilt_deg": [0.0, 30.0, 60.0], "solver": ["a", TITLE],
+            "trial": list(range(60))}
+    return error_models(poses_with_law(8, axes, power_law, bearing_deg=20.0))
+
+
+@pytest.fixture(scope="module")
+def document(models):
+    text = to_json(error_model_document(models, ABOUT))
+    assert text.isascii()
+    return json.loads(text, parse_constant=pytest.fail)
+
+
+def test_the_reader_of_the_guide_gives_the_same_numbers(models, document):
+    """Within and around the region, rounding apart."""
+    rng = np.random.default_rng(1)
+    z = np.exp(rng.uniform(np.log(0.9), np.log(4.5), 150))
+    z[:3] = 1.0, 2.0, 4.0
+    x, y = rng.uniform(-0.5, 0.5, (2, 150)) * z
+    angle = rng.uniform(-5, 80, 150)
+    angle[:3] = 0.0, 30.0, 60.0
+    x[:3] = y[:3] = 0.0
+    read = reader_of_the_guide()
+    bearing = np.degrees(np.arctan2(np.hypot(x, y), z))
+    wanted = [model_errors(models.isel(solver=k), z, angle, None, bearing) for k in (0, 1)]
+    unseen = 0
+    for n, (solver, *position) in enumerate(zip(np.arange(150) % 2, x, y, z, strict=True)):
+        found = read(document["models"][solver], *position, angle[n])
+        unseen += math.isnan(found["z"]["sigma"])
+        for quantity, each in found.items():
+            one = wanted[solver].isel(pose=n).sel(quantity=quantity)
+            for name in ("sigma", "bias"):
+                np.testing.assert_allclose(each[name], one[name], rtol=1e-9, atol=1e-15)
+            assert each["use"] == Use(int(one.use)).name
+    assert 20 < unseen < 130
+    assert math.isnan(read(document["models"][0], 0.0, 0.0, 0.0, 0.0)["z"]["sigma"])
+    assert math.isnan(read(document["models"][0], 0.0, 0.0, -2.0, 0.0, 74.25)["z"]["sigma"])
+
+
+def test_the_table_compares_the_usual_rule(models):
+    table = error_model_table(models)
+    assert table.headings[0] == "solver"
+    assert {row[0] for row in table.rows} == {"a", TITLE}
+    assert {row[table.headings.index("held-out check")] for row in table.rows} == {"few draws"}
+    shown = table.as_json()["rows"][0]
+    assert shown["0.02 d² / sigma z"]["value"] == pytest.approx(
+        20 * shown["distance, m"] ** 2 / shown["z, mm"]["value"], rel=1e-3)

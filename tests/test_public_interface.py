@@ -87,9 +87,9 @@ def test_progress_is_reported_to_a_function_or_in_lines(tmp_path, capsys):
 
     with progress_report(progress=True) as lines:
         sweep.run(FEW, store=tmp_path / "seen.zarr", progress=report)
-    assert [progress.done for progress in seen] == [0, 3]
-    assert {progress.total for progress in seen} == {3}
-    assert capsys.readouterr().err == "0 of 3 poses\n3 of 3 poses\n"
+    assert [(progress.done, progress.total) for progress in seen] == [(0, 3), (3, 3)]
+    told = r"(compiling, once .*\n)?0 of 3 poses\n3 of 3 poses\n"  # in a fresh environment
+    assert re.fullmatch(told, capsys.readouterr().err)
     with progress_report(progress=False) as nothing:
         assert nothing is None
 

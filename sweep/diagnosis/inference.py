@@ -257,12 +257,10 @@ def straight_differs(rows: Observations) -> bool:
 
     It was not where z was measured, too, or is behind the camera.
     """
-    if rows.compared != "z" or np.isfinite(rows.measured[:, 2]).any() or (
-            rows.said[:, 2].min() < 0):
-        return False
+    depth, tape = np.isfinite(rows.measured[:, 2:]).T
     gap = np.linalg.norm(rows.said, axis=1) - rows.said[:, 2]
-    seen = gap > 2.0 * np.hypot(rows.measured_sd[:, 3], rows.zero_sd_m)
-    return bool(seen[np.isfinite(rows.measured[:, 3])].any())
+    seen = tape & (gap > 2.0 * np.hypot(rows.measured_sd[:, 3], rows.zero_sd_m))
+    return rows.compared == "z" and bool(seen.any()) and not (depth | (rows.said[:, 2] < 0.0)).any()
 
 
 def _scaled(_: Observations, points: Floats, spread: Floats) -> Sequence[Floats]:
@@ -286,8 +284,10 @@ CAUSES = (
           _focal_ways, lambda _, points, spread: [points * spread * [0.0, 0.0, 1.0]]),
     Cause("units", "units taken for one another (m, cm, mm, inch, foot)", 1.0,
           "print size and tvec with their units", _unit_ways, _scaled),
-    Cause(STRAIGHT, "z taken for the straight distance, which tvec has right", 1.5,
-          "compare the tape with sqrt(x² + y² + z²)",
+    Cause(STRAIGHT, "z taken for the measured distance, which tvec has right", 1.5,
+          "compare a straight tape with sqrt(x² + y² + z²), one along the floor with sqrt(x² + z²)",
+          lambda _: ways_of(np.stack([np.eye(3), np.diag([1.0, 0.0, 1.0])]),
+                            ["", "the tape lay along the floor"], [9.0, 1.0]),
           lacks=lambda rows: "" if straight_differs(rows) else "a tape off the axis beside z"),
     Cause("offset", "an offset (zero point of the tape, place of the lens, another frame)", 1.0,
           "measure one more distance: an offset stays, a factor grows",
@@ -551,7 +551,7 @@ def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> dict
     bearing = math.radians(BEARING_DEG)
     truth = np.outer(distance, [math.sin(bearing), 0.0, math.cos(bearing)])
     # The program's answer if a were right.
-    said = truth @ np.linalg.inv(undo).T
+    said = truth @ np.linalg.pinv(undo).T
     new = replace(
         rows, said=said, measured_sd=np.tile(tape_sd(distance), (4, 1)).T,
         measured=np.column_stack([truth[:, 0], distance * np.nan, truth[:, 2], distance]),

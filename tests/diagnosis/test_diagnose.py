@@ -68,22 +68,23 @@ def test_rows_that_agree_or_that_nothing_explains_are_said_to(said, tape, words)
     ({"tape_m": []}, "no rows"), ({"tape_m": [1] * 201}, "201"), ({"tvec_z_m": [-1]}, "above 0"),
 ])
 def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
-    with pytest.raises(sweep.ArgumentError, match=re.escape(words)) as error:
+    with pytest.raises(sweep.ArgumentError, match=rf"^.*{re.escape(words)}.*\Z"):
         sweep.diagnose({"tape_m": [1.0]} | columns)
-    assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("f", "u", "v", "k1", "words"), [
-    (600, 426, 239.5, 0, "calibrated at 1.5 times the resolution"),
-    (900, 639.5, 359.5, -0.3, "a distortion that the camera's file lacks")])
-def test_tilted_markers_corners_show_another_resolution_or_lens(f, u, v, k1, words):
+@pytest.mark.parametrize(("f", "u", "v", "k1", "height", "words"), [
+    (600, 426, 239.5, 0, 1, "calibrated at 1.5 times the resolution"),
+    (900, 639.5, 359.5, 0, 0, "which tvec has right: the tape lay along the floor"),
+    (900, 639.5, 359.5, -0.3, 1, "a distortion that the camera's file lacks")])
+def test_tilted_markers_corners_show_another_resolution_lens_or_tape(f, u, v, k1, height, words):
     square = 0.05 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0.0]])
     turn, frame = np.array([2.4, 0.6, 0.3]), np.array([[f, 0, u], [0, f, v], [0, 0, 1]])
-    places = np.array([[0.1, 0.05, 0.6], [-0.3, 0, 1.2], [0.6, 0.2, 1.2], [0, -0.2, 1.9]])
-    columns = {"tape_m": np.linalg.norm(places, axis=1)} | dict(zip(CORNERS, np.transpose([
+    places = np.array([[0.1, 0.05, 0.6], [-0.3, 0, 1.2], [0.6, 0.4, 1.2], [0.2, -0.7, 1.9]])
+    columns = dict(zip(CORNERS, np.transpose([
         cv2.projectPoints(square, turn, place, frame, np.array([k1, 0, 0, 0.0]))[0].ravel()
         for place in places]), strict=True))
-    found = sweep.diagnose(columns, camera=CAMERA, size_m=0.1, compared="range")
+    columns["tape_m"] = np.linalg.norm(places * [1, height, 1], axis=1)
+    found = sweep.diagnose(columns, camera=CAMERA, size_m=0.1, compared="range" if height else "z")
     assert words in found.numbers["sentence"]
 
 
@@ -100,8 +101,7 @@ def test_poses_are_solved_from_images(tmp_path):
     camera = Calibration(640, 480, 600.0, 600.0, 319.5, 239.5, (), (), ())
     settings = {"camera": camera, "dictionary": "DICT_APRILTAG_36h11", "refinement": "subpix"}
     assert first(sweep.diagnose(rows, size_m=0.1, **settings)) == ["agree"]
-    wrong = sweep.diagnose(rows, size_m=0.125, **settings)
-    assert "the white margin" in wrong.numbers["causes"][0]["size"]
+    assert "the white margin" in sweep.diagnose(rows, size_m=0.125, **settings).numbers["sentence"]
     rows.write_text(f"image,tape_m,marker_id\n{names[0]},1,7\n")
     for other, words in ((camera, r"\(IDs 0\): expected one, or marker_id"),
                          (CAMERA, "holds for 1280 x 720, but the photographs are 640 x 480")):

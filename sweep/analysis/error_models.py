@@ -853,7 +853,7 @@ def rows_of(**given: tuple[ArrayLike, int]) -> list[Floats]:
     count = next((len(rows) for rows in found.values() if len(rows) != 1), 1)
     for name, rows in found.items():
         if len(rows) not in (1, count):
-            raise ArgumentError(name, f"of {len(rows):,} poses", f"expected {count:,}, or one")
+            raise ArgumentError(name, "", f"{len(rows):,} poses: expected {count:,}, or one")
     return [np.broadcast_to(rows, (count, *rows.shape[1:])) for rows in found.values()]
 
 

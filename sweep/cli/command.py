@@ -402,7 +402,7 @@ def print_error(error: SweepError) -> int:
     """
     text = str(error)
     if isinstance(error, ArgumentError):
-        given = f" {error.value}" if str(error.value) else ""
+        given = f" {plain(error.value, 300)}" if str(error.value) else ""
         flag = SESSION.flags.get(error.argument, f"--{error.argument.replace('_', '-')}")
         text = f"{flag}{given}: {error.problem}"
     for line in text.split("\n"):

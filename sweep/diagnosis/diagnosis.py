@@ -134,7 +134,7 @@ def size_of(each: inference.Explanation, rows: Observations) -> str:
 
 def label_of(ways: inference.Ways) -> str:
     """Return the names of the three likeliest ways; empty if the likeliest has none."""
-    return " or ".join([*filter(None, dict.fromkeys(ways["label"]))][: 3 * bool(ways["label"][0])])
+    return " or ".join([*filter(None, dict.fromkeys(ways["label"]))][:3]) * bool(ways["label"][0])
 
 
 def _sentence(

@@ -334,9 +334,9 @@ def _detected(
 def _solved(corners: Floats, camera: Calibration, size_m: float) -> tuple[Floats, Floats]:
     """Return positions and rotation vectors (n, 3) of corners (n, 8), by guarded IPPE."""
     quads = corners.reshape(-1, 4, 2)
-    frame = np.array([camera.width_px or np.inf, camera.height_px or np.inf])
-    _each_row(((quads >= -0.5) & (quads <= frame)).all(axis=(1, 2)),
-              f"corners beyond the camera's {frame[0]:g} x {frame[1]:g} px: give their calibration")
+    frame = np.array([camera.width_px or 0, camera.height_px or 0])
+    _each_row(not frame.all() or ((quads >= -0.5) & (quads <= frame)).all(axis=(1, 2)), "corners "
+              f"beyond {frame[0]} x {frame[1]} px: give the calibration of their images' size")
     cameras = cameras_of(camera, len(quads))
     rotation, position = both_planar_solutions(quads, cameras, np.full(len(quads), size_m))
     _each_row(np.isfinite(position[:, 0]).all(axis=-1), "the corners have no pose; expected top "

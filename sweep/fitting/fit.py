@@ -32,6 +32,7 @@ from sweep.fitting.photograph_fit import (
     MARKERS,
     OWN,
     SHARED,
+    SQUARE,
     START,
     VARIANCE,
     MarkerState,
@@ -324,6 +325,7 @@ def geometry_field(fits: Sequence[PhotographFit], edges: Field) -> Field:
 def _beside_truth(states: Sequence[MarkerState]) -> list[tuple[Floats, Floats, Floats]]:
     """Return the shifts (8 n,) of a photograph's corners beside the truth, and how they change.
 
+    A list of one, or of none.
     By one pose of the board (8 n, 6), which is fitted to all corners, and which a file's exact
     poses do not have (8 n, 0); then by the print's size, and by the camera's numbers that are
     themselves estimates, those with standard deviations (8 n, 1 + c). Nothing without such a pose.
@@ -333,10 +335,11 @@ def _beside_truth(states: Sequence[MarkerState]) -> list[tuple[Floats, Floats, F
     quads = np.array([state.marker.corners_px for state in states])
     size = (quads - quads.mean(axis=1, keepdims=True)).reshape(-1, 1)
     if first.source == TruthSource.poses_file:
-        return [(shifts.ravel(), size[:, :0], size)]
-    corners = np.array([
-        each.on_board.board.corners_m[each.on_board.number] for each in places if each.on_board
-    ])
+        by_camera = np.vstack([each.projected(SQUARE)[2] for each in places])
+        free = np.hstack([size, by_camera[:, :len(first.camera.sd)]])
+        return [(shifts.ravel(), size[:, :0], free)]
+    on_board = [each.on_board for each in places if each.on_board]
+    corners = np.array([each.board.corners_m[each.number] for each in on_board])
     if len(corners) < MIN_SHIFTED_MARKERS:
         return []
     frames_px = np.array([[state.marker.frame_px] for state in states])
@@ -353,23 +356,26 @@ def _beside_truth(states: Sequence[MarkerState]) -> list[tuple[Floats, Floats, F
 def print_size(fits: Sequence[PhotographFit]) -> Estimate:
     """Return the size of markers over the board's or the file's, by their fitted corners.
 
-    By least squares of all photographs, beside a pose of each and, where the camera was calibrated
-    from them, beside its numbers; nothing with too few photographs. The corners that a detector
+    By least squares of all photographs, beside a pose of each and, where the camera has standard
+    deviations, beside its numbers; nothing with too few photographs. The corners that a detector
     finds are biased by blur, and so is the truth that they give of boards without a chessboard:
     it is not used. The interval is the jackknife's, by photograph (Efron and Stein, "The jackknife
     estimate of variance", 1981): the camera's error is in it.
     """
-    known = []
-    for shifts, pose, free in (each for fit in fits for each in _beside_truth(fit.states)):
-        columns, (q, _) = np.column_stack([free, shifts]), np.linalg.qr(pose)
-        known.append(columns - q @ (q.T @ columns))
+    # What is left of each photograph beside its pose, in as few rows as columns.
+    known = [
+        np.linalg.qr(np.column_stack([pose, free, shifts])).R[pose.shape[1]:, pose.shape[1]:]
+        for fit in fits for shifts, pose, free in _beside_truth(fit.states)
+    ]
     if len(known) < MIN_PHOTOGRAPHS:
         return Estimate()
-    whole, *without = (
-        np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0][0] for rows in map(
-            np.concatenate, (known, *(known[:k] + known[k + 1:] for k in range(len(known)))))
-    )
-    return estimate(1.0 + whole + (len(known) - 1) * (np.mean(without) - np.array(without)))
+
+    def size_by(photographs: Sequence[Floats]) -> float:
+        rows = np.concatenate(photographs)
+        return float(np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0][0])
+
+    without = np.array([size_by(known[:k] + known[k + 1:]) for k in range(len(known))])
+    return estimate(1.0 + size_by(known) + (len(known) - 1) * (without.mean() - without))
 
 
 def _geometry_sums(
@@ -428,7 +434,7 @@ def _corners(state: MarkerState, variance: float, edges: Field) -> tuple[Floats,
     )
     at_nodes = (columns[:, :, None] * rows[:, None, :]).reshape(-1, NODES**2)
     nodes = np.stack(np.meshgrid(unit, unit, indexing="ij"), axis=-1).reshape(-1, 2)
-    return covariance, marker.shown.pixels(0.5 + reach * nodes), *(by_pixel @ at_nodes)
+    return covariance, marker.shown.projected(0.5 + reach * nodes)[0], *(by_pixel @ at_nodes)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -684,7 +690,7 @@ def _terms(
     widened += float(displaced(np.arange(60), decimation.estimate.value).var())
     variance, amount, bloom = zip(optics, tested, strict=True)
     blur = variance[0].mapped(lambda square: math.sqrt(max(square - widened, 0.0)))
-    unknown = "too few photographs or markers beside a board or exact poses"
+    unknown = "expected 4 photographs with 3 markers of a board, or exact poses"
     # Noise is measured behind the compression, which at edges adds about what it takes from noise
     # in flat areas.
     quality = estimate(np.array([fit.states[0].marker.shown.jpeg_quality for fit in fits]))
@@ -948,8 +954,8 @@ def fit(
     """
     if markers not in range(1, 1001):
         raise ArgumentError("markers", markers, "expected a whole number from 1 to 1000")
-    if {*map(prepare.setting_name, texts_of("settings", settings))} <= {"dictionary", "size_m"}:
-        settings = [*texts_of("settings", settings), COMPARED]
+    settings = texts_of("settings", settings)
+    settings += [COMPARED] * ({*map(prepare.setting_name, settings)} <= {"dictionary", "size_m"})
     with tempfile.TemporaryDirectory() as written:
         home = Path(written).resolve()
         prepared = prepare.prepare(

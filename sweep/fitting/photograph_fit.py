@@ -63,11 +63,15 @@ class Shown(NamedTuple):
     on_board: BoardMarker | None
     jpeg_quality: float
 
-    def pixels(self, points: Floats) -> Floats:
-        """Return the true images (n, 2) of columns and rows (n, 2), shares of the square's side."""
+    def projected(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the true images (n, 2) of columns and rows (n, 2), shares of the square's side.
+
+        Their derivatives by pose and camera follow, as `sweep.photographs.cameras.derivatives` has
+        them.
+        """
         flat = (points - 0.5) * self.size_m * [1.0, -1.0]
         in_plane = np.column_stack([flat, np.zeros(len(flat))])
-        return derivatives(self.camera, in_plane, self.rotation, self.translation)[0]
+        return derivatives(self.camera, in_plane, self.rotation, self.translation)
 
 
 class FittedMarker(NamedTuple):
@@ -188,7 +192,7 @@ def quality_of(encoded: bytes) -> float:
 
 def _spread(every: Sequence[Shown], shape: tuple[int, ...], most: int) -> list[Shown]:
     """Return at most ``most`` of the markers in a frame, the farthest from one another."""
-    corners = [each.pixels(SQUARE) for each in every]
+    corners = [each.projected(SQUARE)[0] for each in every]
     large = [k for k, quad in enumerate(corners) if side_lengths(quad[None]).min() >= MIN_SIDE_PX]
     if len(large) <= most:
         return [every[k] for k in large]
@@ -202,7 +206,7 @@ def _spread(every: Sequence[Shown], shape: tuple[int, ...], most: int) -> list[S
 
 def marker_view(shown: Shown, image: Grey) -> FittedMarker | None:
     """Return the pixels of a marker in a photograph (height, width); None if they are few."""
-    marker, corners = shown.marker, shown.pixels(SQUARE)
+    marker, corners = shown.marker, shown.projected(SQUARE)[0]
     modules = module_count(marker.dictionary)
     optics = cameras_of(shown.camera, 1).optics(0)
     box = photograph_view(
@@ -216,7 +220,7 @@ def marker_view(shown: Shown, image: Grey) -> FittedMarker | None:
     used = (columns >= box.spans[:, :1]) & (columns < box.spans[:, 1:])
     pieces, sides = _split(box.marker.edges)
     ends_at = pieces / modules
-    ends = shown.pixels(ends_at.reshape(-1, 2)).reshape(-1, 2, 2) - frame_px
+    ends = shown.projected(ends_at.reshape(-1, 2))[0].reshape(-1, 2, 2) - frame_px
     if (sides == OUTSIDE).any():
         used &= drawn(ends, sides, used.shape, OUTSIDE_BLUR_PX)[4] < OUTSIDE_SHARE
     if used.sum() < MIN_SIDE_PX**2:
@@ -228,7 +232,7 @@ def marker_view(shown: Shown, image: Grey) -> FittedMarker | None:
         0.5 + (0.5 + ring / modules) * box.at[:, used],
         corners - frame_px, modules, float(side_lengths(corners[None]).mean()) / modules,
         (overhang(marker.dictionary) + 0.5) / modules, frame_px,
-        _along(image, shown.pixels(beyond)),
+        _along(image, shown.projected(beyond)[0]),
     )
 
 

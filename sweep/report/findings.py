@@ -915,6 +915,7 @@ def measure_tradeoff(
         raise ArgumentError("criterion", criterion, f"expected one of {', '.join(CRITERIA)}"
                             + nearest(criterion, CRITERIA))
     for name, value in (
+            # Only a budget may be None.
             ("budget_ms", budget_ms), ("limit_s", "" if limit_s is None else limit_s)):
         check_positive(name, value, "expected a finite number above 0")
     figure = figure_file(output)

@@ -247,7 +247,7 @@ def size(
     >>> found.answers[found.best].value, found.answers[found.best].next
     (40.0, 4.0)
     """
-    check_positive(
+    check_positive(  # also refuses None
         "limit_s", "" if limit_s is None else limit_s, "expected a finite number above 0")
     read = read_pipeline(pipeline)
     rule = read.stopping

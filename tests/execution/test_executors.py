@@ -33,7 +33,7 @@ from sweep.execution.on_cluster import OnCluster, connected
 from sweep.execution.runner import compute, execute
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, Interrupts
-from sweep.store.blocks import StoreReplacedError
+from sweep.store.blocks import StoreReplacedError, committed
 from sweep.store.lifecycle import create_store, open_store
 
 PIPELINE = Pipeline.from_text(
@@ -263,7 +263,7 @@ def test_a_store_is_read_and_written_where_its_path_led_at_first(tmp_path, monke
     monkeypatch.chdir(tmp_path / "other")
     assert (results.detection != 0).all()
     assert (opened.array("detection")[...] != 0).all()
-    assert not begun.finished
+    assert not committed(begun)
     assert (tmp_path / "new.zarr/zarr.json").exists()
 
 

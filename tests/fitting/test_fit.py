@@ -84,7 +84,7 @@ def test_intervals_of_every_effect_hold_the_truth_and_the_scene_is_a_pipeline(se
     print(f"of {len(sets)} sets, intervals that hold the truth: {np.mean(held):.3f},",
           dict(zip(TRUTH, np.mean(held, axis=0).round(2).tolist(), strict=True)))
     # Binomial: with 0.90 each, fewer than 12 of 24 have a probability of 1e-7. Shares of a set's
-    # ten deviate by 0.1: 0.82 is five standard deviations of their mean below 0.92.
+    # ten deviate by 0.1: 0.82 is five standard deviations of their mean below 0.92. Together 1e-6.
     assert np.mean(held, axis=0).min() > 0.49
     assert np.mean(held) > 0.82
     scene = sweep.Pipeline.from_text(sets[0].text).fixed

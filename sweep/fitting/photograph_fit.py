@@ -405,7 +405,7 @@ def state_at(marker: FittedMarker, parameters: Floats) -> MarkerState:
 
 def fitted_state(marker: FittedMarker, start: Floats, moved: Masks) -> MarkerState:
     """Return the state of least squares; ``moved`` (13,) says which parameters are moved."""
-    at = state_at(marker, start)
+    at = state_at(marker, np.clip(start, LOW, HIGH))
 
     def residuals(values: Floats) -> Floats:
         nonlocal at
